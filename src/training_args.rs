@@ -31,7 +31,7 @@ pub(crate) struct TrainingArgs {
     pub(crate) seed: Option<u64>,
     /// Maximum GPU memory of each model in bytes, at least 1000000 and enough for the smallest model of the method
     /// [default: the rig file's, else no limit]
-    #[arg(long, value_name = "BYTES", value_parser = value_parser!(u64).range(MAX_BYTES_RANGE))]
+    #[arg(long, value_name = "BYTES", value_parser = max_bytes)]
     pub(crate) max_bytes: Option<u64>,
     /// Maximum number of splats, 1 to 100000000 [default: the rig file's, else 400000]
     #[arg(long, value_name = "N", value_parser = value_parser!(u64).range(MAX_SPLATS_RANGE))]
@@ -66,6 +66,14 @@ fn methods(text: &str) -> Result<Methods, String> {
         kinds.push(kind);
     }
     Ok(Methods(kinds))
+}
+
+/// Parses a value of `--max-bytes`.
+fn max_bytes(text: &str) -> Result<u64, String> {
+    let found = text.parse().ok().filter(|bytes| MAX_BYTES_RANGE.contains(bytes));
+    found.ok_or_else(|| {
+        format!("must be a number of bytes from {}, such as 4000000000 for 4 GB", MAX_BYTES_RANGE.start())
+    })
 }
 
 /// Parses a value of `--refine`.

@@ -2,8 +2,8 @@
 //!
 //! Benches that train ([`curve`], [`budget`], [`ablation`] and [`stability`]) save each run to a file when it ends, so
 //! that a bench continued in the same folder does not repeat it. [`kernels`] and [`field`] measure the speed of the
-//! trainer, [`stamps`] the errors of image stamps, and [`memory`] evaluates samples of the memory of a long run. The
-//! results are [`Findings`]: JSON with every number, charts, and a page.
+//! trainer, [`stamps`] the errors of image stamps, [`live`] evaluates a live run with viewers, and [`memory`] samples of
+//! the memory of a long run. The results are [`Findings`]: JSON with every number, charts, and a page.
 //!
 //! The caller opens the GPU, requests stops and receives reports ([`Host`], [`BenchObserver`]).
 //!
@@ -36,6 +36,7 @@ pub mod field;
 mod findings;
 mod growth;
 pub mod kernels;
+pub mod live;
 pub mod memory;
 mod peer;
 mod runs;
@@ -51,4 +52,4 @@ pub use growth::{Excluded, Growth, Sample, resident_bytes};
 pub use runs::{BenchObserver, Disturbed, Host, Run, RunReport, RunScores, RunSettings, RunsOptions};
 // Benches fail where sessions and files do, so their errors have the same causes and classes.
 pub use session::{Error, Result};
-pub use viewer::Viewer;
+pub use viewer::{ReceivedPicture, Viewer, ViewerOptions};

@@ -6,17 +6,15 @@ use crate::Result;
 use keyframe::{ensure, failed};
 use kinematics::Transform;
 use nalgebra::{Point3, Vector3};
+use parking_lot::Mutex;
 use serde_json::{Value, json};
 use session::Context;
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{Shutdown, SocketAddr, TcpStream};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
 use std::thread::JoinHandle;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
-/// Size of the requested images, pixels.
-const SIZE_PX: [u32; 2] = [960, 720];
 /// Angle between two views on the circle around the scene, radians.
 const STEP_RAD: f64 = 0.05;
 /// The connection counts as dead after this long without a byte: the server sends its status several times a second.
@@ -32,11 +30,45 @@ const CLOSE: u8 = 8;
 const PING: u8 = 9;
 const PONG: u8 = 10;
 
+/// What a viewer requests.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ViewerOptions {
+    /// Width and height, pixels.
+    pub size_px: [u32; 2],
+    /// All directions around a point in the scene (equirectangular) instead of a pinhole view from outside.
+    pub is_panorama: bool,
+}
+
+impl Default for ViewerOptions {
+    fn default() -> Self {
+        Self { size_px: [960, 720], is_panorama: false }
+    }
+}
+
+/// A complete picture as its viewer saw it.
+#[derive(Clone, Copy, Debug)]
+pub struct ReceivedPicture {
+    /// It was requested.
+    pub requested: Instant,
+    /// Its first stage was complete.
+    pub first_stage: Instant,
+    /// Its last stage was complete.
+    pub complete: Instant,
+    /// Time from the arrival of the request at the server until its last stage began to be rendered, milliseconds.
+    pub waited_millis: f64,
+    /// Time for rendering the last stage, milliseconds.
+    pub render_millis: f64,
+    /// Time for encoding the last stage, milliseconds.
+    pub encode_millis: f64,
+    /// Number of keyframes, since the start of the run, that the model had taken a step with.
+    pub n_keyframes: u64,
+}
+
 /// A connected viewer; it disconnects when dropped.
 #[derive(Debug)]
 pub struct Viewer {
     stream: TcpStream,
-    n_pictures: Arc<AtomicU64>,
+    pictures: Arc<Mutex<Vec<ReceivedPicture>>>,
     thread: Option<JoinHandle<Result<()>>>,
 }
 
@@ -46,27 +78,36 @@ impl Viewer {
     /// # Errors
     ///
     /// If the server does not accept the connection.
-    pub fn connect(address: SocketAddr) -> Result<Self> {
+    pub fn connect(address: SocketAddr, options: ViewerOptions) -> Result<Self> {
         let stream = TcpStream::connect(address).with_context(|| format!("cannot connect to {address}"))?;
         stream.set_read_timeout(Some(MAX_SILENCE)).context("cannot set a timeout")?;
-        let n_pictures = Arc::new(AtomicU64::new(0));
+        let pictures = Arc::default();
         let mut client = Client {
             reader: BufReader::new(stream.try_clone().context("cannot share a connection")?),
             stream: stream.try_clone().context("cannot share a connection")?,
-            n_pictures: n_pictures.clone(),
+            options,
+            pictures: Arc::clone(&pictures),
             n_requested: 0,
+            requested: Instant::now(),
+            first_stage: None,
             center_m: Point3::origin(),
             radius_m: 1.0,
         };
         client.handshake(address)?;
         let thread = std::thread::Builder::new().name("viewer".into()).spawn(move || client.run());
-        Ok(Self { stream, n_pictures, thread: Some(thread.context("cannot start a thread")?) })
+        Ok(Self { stream, pictures, thread: Some(thread.context("cannot start a thread")?) })
     }
 
     /// Number of complete images received so far.
     #[must_use]
     pub fn n_pictures(&self) -> u64 {
-        self.n_pictures.load(Ordering::Relaxed)
+        self.pictures.lock().len() as u64
+    }
+
+    /// The complete pictures received so far.
+    #[must_use]
+    pub fn pictures(&self) -> Vec<ReceivedPicture> {
+        self.pictures.lock().clone()
     }
 
     /// Whether it still receives.
@@ -89,8 +130,13 @@ impl Drop for Viewer {
 struct Client {
     reader: BufReader<TcpStream>,
     stream: TcpStream,
-    n_pictures: Arc<AtomicU64>,
+    options: ViewerOptions,
+    pictures: Arc<Mutex<Vec<ReceivedPicture>>>,
     n_requested: u64,
+    /// When the current picture was requested.
+    requested: Instant,
+    /// When its first stage was complete.
+    first_stage: Option<Instant>,
     /// Center of the scene in world.
     center_m: Point3<f64>,
     radius_m: f64,
@@ -158,8 +204,22 @@ impl Client {
         ensure!(n_header <= n_bytes.saturating_sub(4).min(MAX_HEADER_BYTES), "a header of {n_header} bytes");
         let header: Value = serde_json::from_reader((&mut self.reader).take(n_header))?;
         self.skip(n_bytes.saturating_sub(4 + n_header))?;
-        if header["type"] == "picture" && header["last"] == true {
-            self.n_pictures.fetch_add(1, Ordering::Relaxed);
+        if header["type"] != "picture" {
+            return Ok(());
+        }
+        let now = Instant::now();
+        let first_stage = *self.first_stage.get_or_insert(now);
+        if header["last"] == true {
+            let millis = |name: &str| header[name].as_f64().unwrap_or_default();
+            self.pictures.lock().push(ReceivedPicture {
+                requested: self.requested,
+                first_stage,
+                complete: now,
+                waited_millis: millis("waited_millis"),
+                render_millis: millis("render_millis"),
+                encode_millis: millis("encode_millis"),
+                n_keyframes: header["keyframes"].as_u64().unwrap_or_default(),
+            });
             self.request_picture()?;
         }
         Ok(())
@@ -168,18 +228,24 @@ impl Client {
     /// Requests the next image on a circle around the scene.
     fn request_picture(&mut self) -> Result<()> {
         let angle = self.n_requested as f64 * STEP_RAD;
-        let offset = Vector3::new(angle.cos(), angle.sin(), 0.7) * 1.5 * self.radius_m;
+        let (is_panorama, size_px) = (self.options.is_panorama, self.options.size_px);
+        let distance_m = if is_panorama { 0.2 } else { 1.5 } * self.radius_m;
+        let offset = Vector3::new(angle.cos(), angle.sin(), 0.7) * distance_m;
         // `face_towards` has z forward and y up, but a camera's y axis points down.
         let world_from_camera = Transform::face_towards(&(self.center_m + offset), &self.center_m, &-Vector3::z());
         let request = json!({
             "type": "render",
             "id": self.n_requested,
             "world_from_camera": world_from_camera.to_homogeneous().transpose().as_slice(),
-            "size_px": SIZE_PX,
-            "projection": { "kind": "pinhole", "vertical_fov_rad": 0.9 },
+            "size_px": size_px,
+            "projection": match is_panorama {
+                true => json!({ "kind": "equirectangular" }),
+                false => json!({ "kind": "pinhole", "vertical_fov_rad": 0.9 }),
+            },
             "outputs": ["color", "depth"],
         });
         self.n_requested += 1;
+        (self.requested, self.first_stage) = (Instant::now(), None);
         self.send(TEXT, request.to_string().as_bytes())
     }
 
@@ -232,7 +298,6 @@ impl Client {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use std::time::Instant;
     use trainer::Picture;
     use viz::{Hub, Server, ServerConfig};
 
@@ -241,7 +306,7 @@ mod tests {
         let hub = Hub::new();
         let listen = "127.0.0.1:0".parse().expect("an address");
         let server = Server::start(ServerConfig { listen }, hub.clone()).expect("a free port");
-        let viewer = Viewer::connect(server.address()).expect("served");
+        let viewer = Viewer::connect(server.address(), ViewerOptions::default()).expect("served");
         let started = Instant::now();
         let mut n_drawn = 0;
         while viewer.n_pictures() < 3 {
@@ -278,7 +343,7 @@ mod tests {
             assert!(n_read > 0);
             stream.write_all(b"HTTP/1.1 404 Not Found\r\n\r\n").expect("sent");
         });
-        let error_message = Viewer::connect(address).expect_err("no WebSocket").to_string();
+        let error_message = Viewer::connect(address, ViewerOptions::default()).expect_err("no WebSocket").to_string();
         assert!(error_message.contains("404"), "{error_message}");
         other.join().expect("no panic");
     }

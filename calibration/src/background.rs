@@ -1,5 +1,5 @@
-//! Alignment in parallel with training: starts with the first step on its own thread; the result is applied at a
-//! fixed step.
+//! Runs alignment in parallel with training. Alignment starts with the first training step, on its own thread; its
+//! result is applied at a fixed step.
 
 use crate::registration::{Alignment, align};
 use crate::{CalibratedCamera, CameraCorrection, CameraRefinement, Error};
@@ -7,8 +7,8 @@ use keyframe::Keyframe;
 use std::sync::Arc;
 use std::thread::JoinHandle;
 
-/// Step at which the result is applied, after waiting for it if necessary. It is smaller on software adapters, where
-/// steps are as expensive as alignment.
+/// Step at which training waits for the result and applies it. It is smaller on software adapters, where a step takes
+/// as long as alignment.
 const ALIGNMENT_STEP: u64 = 400;
 const SOFTWARE_ALIGNMENT_STEP: u64 = 50;
 
@@ -18,61 +18,80 @@ pub fn alignment_step(is_software: bool, n_planned_steps: u64) -> u64 {
     default_step.min(n_planned_steps / 4).max(1)
 }
 
-/// State of the alignment.
+/// Alignment in the background, once or several times with more keyframes.
 #[derive(Debug)]
-pub enum AlignmentTask {
-    /// Starts with the next step.
+pub struct AlignmentTask {
+    state: TaskState,
+    /// The latest result; `None` before the first end, or if alignment was not possible.
+    result: Option<Alignment>,
+}
+
+#[derive(Debug)]
+enum TaskState {
+    /// Alignment can start.
     Requested,
-    /// Runs on its own thread.
+    /// Alignment runs on its own thread.
     Running(JoinHandle<Option<Alignment>>),
-    /// Finished, with the result if alignment was possible.
-    Done(Option<Alignment>),
+    /// Alignment has finished or was not requested.
+    Done,
 }
 
 impl AlignmentTask {
     /// Requests alignment unless `choice` selects no parameter.
     pub fn new(choice: &CameraRefinement) -> Self {
-        let is_requested = match choice {
-            CameraRefinement::Always(params) => !params.is_empty(),
-            CameraRefinement::Try(candidates) => !candidates.is_empty(),
-        };
-        if is_requested { Self::Requested } else { Self::Done(None) }
+        let is_requested = !choice.always().is_empty() || !choice.candidates().is_empty();
+        Self { state: if is_requested { TaskState::Requested } else { TaskState::Done }, result: None }
     }
 
-    /// The result; `None` before the end, or if alignment was not possible.
+    /// Alignment that ended with this result.
+    pub fn done(result: Option<Alignment>) -> Self {
+        Self { state: TaskState::Done, result }
+    }
+
+    /// The latest result; `None` before the first end, or if alignment was not possible.
     pub fn result(&self) -> Option<&Alignment> {
-        match self {
-            Self::Done(result) => result.as_ref(),
-            Self::Requested | Self::Running(_) => None,
-        }
+        self.result.as_ref()
     }
 
     /// Whether alignment has not started yet.
     pub fn is_requested(&self) -> bool {
-        matches!(self, Self::Requested)
+        matches!(self.state, TaskState::Requested)
     }
 
     /// Whether alignment has ended or was not requested.
     pub fn is_done(&self) -> bool {
-        matches!(self, Self::Done(_))
+        matches!(self.state, TaskState::Done)
     }
 
-    /// Starts alignment on its own thread.
+    /// Requests another alignment. Its result replaces the latest one.
+    pub fn request_again(&mut self) {
+        self.state = TaskState::Requested;
+    }
+
+    /// Starts alignment of uncorrected keyframes on its own thread.
     pub fn begin(&mut self, keyframes: Vec<Arc<Keyframe>>, choice: &CameraRefinement) {
         let choice = choice.clone();
-        *self = Self::Running(std::thread::spawn(move || run_in_background_pool(|| align(&keyframes, &choice))));
+        self.state =
+            TaskState::Running(std::thread::spawn(move || run_in_background_pool(|| align(&keyframes, &choice))));
     }
 
-    /// Waits for the result. Returns whether keyframes must be corrected.
-    pub fn finish(&mut self) -> Result<bool, Error> {
-        let Self::Running(thread) = std::mem::replace(self, Self::Done(None)) else { return Ok(false) };
+    /// Waits for the result. Returns whether these keyframes must be corrected differently than before. If alignment
+    /// was not possible, the latest result stays.
+    pub fn finish(&mut self, keyframes: &[Arc<Keyframe>]) -> Result<bool, Error> {
+        let TaskState::Running(thread) = std::mem::replace(&mut self.state, TaskState::Done) else { return Ok(false) };
         let result = thread.join().map_err(|_| Error::AlignmentPanicked)?;
         for line in result.iter().flat_map(Alignment::lines) {
             log::info!("{line}");
         }
-        let has_corrections = result.as_ref().is_some_and(Alignment::has_corrections);
-        *self = Self::Done(result);
-        Ok(has_corrections)
+        let Some(result) = result else { return Ok(false) };
+        let is_changed = match &self.result {
+            None => result.has_corrections(),
+            Some(latest) => keyframes.iter().any(|keyframe| latest.differs(&result, keyframe)),
+        };
+        if is_changed || self.result.is_none() {
+            self.result = Some(result);
+        }
+        Ok(is_changed)
     }
 
     fn correction(&self, camera: &str) -> Option<&CameraCorrection> {
@@ -87,7 +106,8 @@ impl AlignmentTask {
         }
     }
 
-    /// The camera of a keyframe with the corrections of alignment, then those estimated with the splats.
+    /// The camera of a keyframe with the corrections of alignment, followed by the corrections that were learned with
+    /// the splats.
     pub fn calibrated_camera(&self, keyframe: &Keyframe, learned: Option<&CameraCorrection>) -> CalibratedCamera {
         let posed = |keyframe: &Keyframe| {
             learned.map_or_else(|| CalibratedCamera::of(keyframe), |correction| correction.apply(keyframe))
@@ -102,8 +122,8 @@ impl AlignmentTask {
     }
 }
 
-/// Runs `work` in a thread pool of its own, so that training, which downscales images on all processors, does not
-/// wait for it.
+/// Runs `work` in a separate thread pool. In the global pool, training, which downscales images on all processors,
+/// would wait for it.
 pub fn run_in_background_pool<T: Send>(work: impl FnOnce() -> T + Send) -> T {
     let n_processors = std::thread::available_parallelism().map_or(1, usize::from);
     match rayon::ThreadPoolBuilder::new().num_threads((3 * n_processors).div_ceil(4)).build() {

@@ -1,4 +1,4 @@
-//! Corrections of one camera, and the camera of a keyframe with them.
+//! Calibration corrections of one camera, and their application to keyframes.
 
 use keyframe::{DepthMap, Keyframe, Shutter};
 use kinematics::{Stamp, Transform, Twist, f32_of, transform};
@@ -14,7 +14,7 @@ pub struct CameraCorrection {
     pub rotation_rad: [f64; 3],
     /// Translation in the camera's axes, meters.
     pub translation_m: [f64; 3],
-    /// Time from the nominal pose of an image to its exposure, seconds.
+    /// Time from the stamp at which the pose was computed to the exposure of the image, seconds.
     pub time_offset_secs: f64,
     /// Logarithm of the factor on the focal lengths.
     pub log_focal: [f64; 2],
@@ -31,15 +31,15 @@ pub struct CameraCorrection {
     pub log_depth_scale: f64,
     /// Offset added to the readout time, seconds.
     pub readout_secs: f64,
-    /// Rotation vector (radians) and translation (meters) of each training image, by stamp in nanoseconds;
-    /// interpolated linearly in between.
+    /// Pose correction of each training image, by stamp in nanoseconds: rotation vector (radians) and translation
+    /// (meters). Interpolated linearly between images.
     pub drift: BTreeMap<i64, [f64; 6]>,
-    /// Share of the interpolated drift that is applied to images that were not trained on, 0 to 1.
+    /// Share of the interpolated drift that is applied to images without an entry in `drift`, 0 to 1.
     pub drift_weight: f64,
     /// Logarithms of the gains of red, green and blue of each training image, by stamp in nanoseconds.
     pub log_gains: BTreeMap<i64, [f64; 3]>,
-    /// Appearance embeddings of each training image in a neural field, by stamp in nanoseconds. The values have no
-    /// meaning outside the field.
+    /// Appearance embedding of each training image in a neural field, by stamp in nanoseconds. The values have no
+    /// meaning outside this field.
     pub appearance_embeddings: BTreeMap<i64, [f64; EMBEDDING_DIM]>,
 }
 
@@ -80,12 +80,12 @@ pub struct CalibratedCamera {
     pub shutter: Option<Shutter>,
     /// Pose of the depth frame in the camera frame, if there is depth.
     pub color_from_depth: Option<Transform>,
-    /// Factors on red, green and blue of a picture that match it to the image: exposure and white balance.
+    /// Factors on red, green and blue that match a render to the exposure and white balance of the image.
     pub gains: [f64; 3],
 }
 
 impl CalibratedCamera {
-    /// The camera of a keyframe without any correction.
+    /// The uncorrected camera of a keyframe.
     pub fn of(keyframe: &Keyframe) -> Self {
         Self {
             world_from_camera: keyframe.world_from_camera,
@@ -134,13 +134,14 @@ impl CameraCorrection {
         }
     }
 
-    /// Drift of an image: its own, or the weighted interpolation between its neighbors in time.
+    /// Drift of an image: its own entry if there is one, otherwise the interpolation between its neighbors in time,
+    /// multiplied by `drift_weight`.
     pub fn drift_at(&self, stamp: Stamp) -> [f64; 6] {
         let share = if self.drift.contains_key(&stamp.0) { 1.0 } else { self.drift_weight };
         interpolate(&self.drift, stamp).unwrap_or_default().map(|part| share * part)
     }
 
-    /// Transform from the uncorrected camera to the camera at the exposure of the image.
+    /// Motion of the camera from the uncorrected pose to the pose at the exposure of the image.
     pub fn time_corrected_from_input(&self, keyframe: &Keyframe) -> Transform {
         keyframe.twist.map_or(Transform::identity(), |twist| {
             rigid_transform(-self.time_offset_secs * twist.angular_rad_s, -self.time_offset_secs * twist.linear_m_s)
@@ -203,15 +204,15 @@ pub fn interpolate<const N: usize>(known: &BTreeMap<i64, [f64; N]>, stamp: Stamp
 
 /// Share of the drift between images that also applies to other images, 0 to 1.
 ///
-/// Leaves out each image, predicts its drift from its neighbors in time, and returns 1 minus the ratio of the squared
-/// prediction errors to the squared drifts.
+/// Leaves out each image in turn, predicts its drift from its neighbors in time, and returns 1 minus the ratio of the
+/// squared prediction errors to the squared drifts.
 ///
 /// Returns 0 if the errors of images are independent, if predicting is worse than assuming no drift, or if there are
 /// too few images.
 ///
 /// * `scene_size_m`: lever arm that converts rotations to lengths.
 pub fn drift_weight(drift: &BTreeMap<i64, [f64; 6]>, scene_size_m: f64) -> f64 {
-    /// Smaller weights may be due to chance.
+    /// Smaller weights are set to zero, because they may be due to chance.
     const MIN_WEIGHT: f64 = 0.2;
     let known: Vec<(f64, &[f64; 6])> = drift.iter().map(|(stamp, parts)| (*stamp as f64, parts)).collect();
     let squares = |parts: [f64; 6]| {
@@ -229,13 +230,13 @@ pub fn drift_weight(drift: &BTreeMap<i64, [f64; 6]>, scene_size_m: f64) -> f64 {
     if share < MIN_WEIGHT { 0.0 } else { share }
 }
 
-/// Rotation, then translation.
+/// The rigid motion that rotates by a rotation vector, then translates.
 pub fn rigid_transform(rotation_rad: Vector3<f64>, translation_m: Vector3<f64>) -> Transform {
     Transform::from_parts(Translation3::from(translation_m), UnitQuaternion::from_scaled_axis(rotation_rad))
 }
 
-/// Whether the depth image has the lens of the color image, for example because it was registered to it. If so, lens
-/// corrections apply to both.
+/// Whether the depth image has the same lens as the color image, for example because it was registered to the color
+/// image. If so, lens corrections apply to both.
 pub fn shares_lens(keyframe: &Keyframe, depth: &DepthMap) -> bool {
     const TOLERANCE_FRAC: f64 = 1e-4; // Sizes are rounded to pixels.
     [0, 1].into_iter().all(|axis| {

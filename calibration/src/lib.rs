@@ -1,10 +1,10 @@
 //! Calibration parameters of cameras and their estimation from keyframes.
 //!
-//! A [`CameraCorrection`] holds the estimated errors of one camera: extrinsics (hand-eye), time offset, intrinsics, joint
-//! offsets, and the pose, scale and timing of its depth camera. A [`ParamSet`] selects which of them are estimated.
-//! [`align`] estimates them by registering keyframes with depth, keeps those that improve validation images
-//! ([`Trial`], [`Gain`]) and reports the others with their uncertainty. [`AlignmentTask`] does that in parallel with
-//! training. [`register_station`] estimates the pose of a mobile base at one station.
+//! A [`CameraCorrection`] holds the estimated errors of one camera: extrinsics (hand-eye), time offset, intrinsics,
+//! joint offsets, and the pose, scale and timing of its depth camera. A [`ParamSet`] selects which of them are
+//! estimated. [`align`] estimates them by registering keyframes with depth, keeps those that improve validation images
+//! ([`Trial`]), and reports their uncertainty. [`AlignmentTask`] runs [`align`] in parallel with training.
+//! [`register_station`] estimates the pose of a mobile base at one station.
 //!
 //! ```
 //! use calibration::CameraCorrection;
@@ -24,7 +24,6 @@
 mod background;
 mod correction;
 mod error;
-mod gain;
 mod params;
 mod registration;
 #[cfg(any(test, feature = "scenes"))]
@@ -36,10 +35,9 @@ pub use correction::{
     CalibratedCamera, CameraCorrection, EMBEDDING_DIM, drift_weight, interpolate, rigid_transform, shares_lens,
 };
 pub use error::Error;
-pub use gain::{Gain, MIN_GAIN_DB};
 pub use params::ParamSet;
 pub use registration::{
     Alignment, Estimate, PoseEstimate, ScalarEstimate, StationCorrection, Unobservable, align, candidates,
     register_station,
 };
-pub use trial::{CameraRefinement, Candidate, Trial, TrialReport};
+pub use trial::{CameraRefinement, Candidate, MIN_VALIDATION_IMAGES, Trial, TrialReport};

@@ -26,8 +26,8 @@ bitflags::bitflags! {
         const IMAGE_POSES = 1 << 3;
         /// Gains of red, green and blue of each image.
         const IMAGE_GAINS = 1 << 4;
-        /// Offset added to the reading of each joint that carries a camera. Only alignment estimates this parameter
-        /// and the following ones.
+        /// Offset added to the readings of each joint that carries a camera. This parameter and the following ones are
+        /// estimated only by alignment.
         const JOINTS = 1 << 5;
         /// Pose of the depth frame in the camera frame.
         const DEPTH_POSE = 1 << 6;
@@ -56,7 +56,8 @@ impl std::fmt::Display for ParamSet {
     }
 }
 
-/// Written as a map from the names of all parameters, in lower case, to whether the set contains them.
+/// Serializes the set as a map from the names of all parameters, in lower case, to booleans: whether the set contains
+/// them.
 impl Serialize for ParamSet {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         let all = Self::all();

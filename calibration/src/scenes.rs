@@ -44,7 +44,7 @@ pub fn camera_at(joints: Joints) -> Transform {
     base_from_flange(joints) * flange_from_camera()
 }
 
-/// Joint positions of a scan at a time in seconds, with all joints or with the azimuth only.
+/// Joint positions of a scan at a time in seconds, in which all joints move or only the azimuth.
 pub fn joints_at(secs: f64, azimuth_only: bool) -> Joints {
     let wave = |size: f64, hz: f64, phase: f64| size * (2.0 * std::f64::consts::PI * hz * secs + phase).sin();
     match azimuth_only {
@@ -90,13 +90,13 @@ fn cast(from: Point3<f64>, ray: Vector3<f64>) -> (f64, f64) {
 /// Calibration errors and image noise.
 #[derive(Clone)]
 pub struct Miscalibration {
-    /// The input camera pose is the true pose times this.
+    /// Extrinsics error: the input camera pose is the true pose times this transform.
     pub extrinsics: Transform,
     /// Time by which the input poses lag behind the images, seconds.
     pub time_offset_secs: f64,
     /// Error of the joint readings.
     pub joints: Joints,
-    /// The input pose of the depth frame is the true pose times this.
+    /// Error of the depth pose: the input pose of the depth frame is the true pose times this transform.
     pub depth_pose: Transform,
     /// Relative error of the focal lengths.
     pub focal_frac: f64,
@@ -108,14 +108,14 @@ pub struct Miscalibration {
     pub azimuth_only: bool,
     /// Whether rows are exposed one after the other.
     pub has_rolling_shutter: bool,
-    /// Image noise: 1 is that of a real camera.
+    /// Image noise relative to that of a real camera.
     pub noise: f64,
     /// Seed of the noise.
     pub seed: u64,
 }
 
 impl Miscalibration {
-    /// No error; ordinary noise.
+    /// No calibration error, with ordinary noise.
     pub fn none() -> Self {
         Self {
             extrinsics: Transform::identity(),
@@ -133,7 +133,7 @@ impl Miscalibration {
     }
 }
 
-/// Normally distributed noise, the same for the same key.
+/// Normally distributed noise that depends only on the key.
 fn noise(key: u64) -> f64 {
     Random::new(key).normal()
 }

@@ -1,10 +1,15 @@
-//! Results of A/B trials: whether a change of a model is a significant gain on validation images.
+//! Results of A/B trials: the gain of a change of a model on validation images, and whether it is significant.
 
 use crate::ParamSet;
-use crate::gain::{Gain, MIN_GAIN_DB};
 use serde::{Deserialize, Serialize};
 
-/// Gains from twice as many splats that are below this value are not significant, dB.
+/// Minimum number of validation images for a trial.
+pub const MIN_VALIDATION_IMAGES: usize = 4;
+/// Minimum gain of camera parameters and of a color degree, dB.
+const MIN_GAIN_DB: f64 = 0.05;
+/// Minimum gain in standard errors.
+const MIN_STANDARD_ERRORS: f64 = 2.0;
+/// Minimum gain that justifies twice as many splats, dB.
 const MIN_GAIN_OF_DOUBLING_DB: f64 = 0.1;
 
 /// Selection of the camera parameters to optimize.
@@ -22,13 +27,25 @@ impl Default for CameraRefinement {
     }
 }
 
+impl CameraRefinement {
+    /// The parameters that are optimized without a trial.
+    pub fn always(&self) -> ParamSet {
+        if let Self::Always(params) = self { *params } else { ParamSet::empty() }
+    }
+
+    /// The sets of parameters to try, in this order.
+    pub fn candidates(&self) -> &[ParamSet] {
+        if let Self::Try(candidates) = self { candidates } else { &[] }
+    }
+}
+
 /// A change of the model that a trial tests.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Candidate {
     /// Optimizes these camera parameters in addition.
     Cameras(ParamSet),
-    /// Removes the half of the splats that contributes least.
+    /// Removes the half of the splats with the smallest contribution.
     Halved {
         /// Splats before.
         from: u32,
@@ -70,6 +87,14 @@ impl std::fmt::Display for Candidate {
 }
 
 /// Result of a trial.
+///
+/// ```
+/// use calibration::{Candidate, ParamSet, Trial};
+///
+/// let poses = Candidate::Cameras(ParamSet::IMAGE_POSES);
+/// assert!(Trial::of_gains(poses, &[0.4, 0.5, 0.3, 0.45]).kept);
+/// assert!(!Trial::of_gains(poses, &[0.9, -0.8, 0.7, -0.6]).kept, "the images disagree");
+/// ```
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Trial {
     /// The change that was tested.
@@ -87,20 +112,32 @@ pub struct Trial {
 impl Trial {
     /// Evaluates paired scores, dB.
     pub fn of(candidate: Candidate, baseline_db: &[f64], variant_db: &[f64]) -> Self {
-        let gains: Vec<f64> =
-            baseline_db.iter().zip(variant_db).map(|(baseline, variant)| variant - baseline).collect();
-        let gain = Gain::of(&gains);
-        let min_db = candidate.min_gain_db();
-        let Gain { mean_db: gain_db, standard_error_db, n_images } = gain;
+        let gains_db = baseline_db.iter().zip(variant_db).map(|(baseline, variant)| variant - baseline);
+        Self::of_gains(candidate, &gains_db.collect::<Vec<f64>>())
+    }
+
+    /// Evaluates the gains of single images, dB.
+    pub fn of_gains(candidate: Candidate, gains_db: &[f64]) -> Self {
+        let n = gains_db.len().max(1) as f64;
+        let gain_db = gains_db.iter().sum::<f64>() / n;
+        let variance = gains_db.iter().map(|gain| (gain - gain_db).powi(2)).sum::<f64>() / f64::max(n - 1.0, 1.0);
+        let standard_error_db = (variance / n).sqrt();
+        let (n_images, min_db) = (gains_db.len(), candidate.min_gain_db());
         // In case of doubt, neither additions nor reductions are accepted.
         let is_significant = match candidate.reduces_model() {
             true => -gain_db + 0.5 * standard_error_db <= min_db,
-            false => gain.is_significant(min_db),
+            false => gain_db > f64::max(min_db, MIN_STANDARD_ERRORS * standard_error_db),
         };
         Self { candidate, gain_db, standard_error_db, n_images, kept: n_images > 1 && is_significant }
     }
 
-    /// Report on the part of the model that was tested: the addition, or what the reduction would remove.
+    /// Rejects the change if there are fewer than [`MIN_VALIDATION_IMAGES`].
+    #[must_use]
+    pub fn with_enough_images(self) -> Self {
+        Self { kept: self.kept && self.n_images >= MIN_VALIDATION_IMAGES, ..self }
+    }
+
+    /// Report on the tested part of the model: the addition, or the part that the reduction would remove.
     pub fn report(&self) -> TrialReport {
         let (candidate, is_reduction) = match self.candidate {
             Candidate::Cameras(params) => (params.to_string(), false),
@@ -118,28 +155,32 @@ impl Trial {
 
     /// Logs the result.
     pub fn log_result(&self) {
-        let verdict = match (self.candidate, self.kept) {
-            (Candidate::Cameras(_), true) => "accepted",
-            (Candidate::Cameras(_), false) => "not significant",
-            (Candidate::Halved { .. } | Candidate::ShDegree { .. }, true) => "sufficient",
-            (Candidate::Halved { .. } | Candidate::ShDegree { .. }, false) => "not sufficient",
+        let verdict = match (self.candidate.reduces_model(), self.kept) {
+            (false, true) => "accepted",
+            (false, false) => "not significant",
+            (true, true) => "sufficient",
+            (true, false) => "not sufficient",
         };
-        log::info!(
-            "{}: {:+.2} dB on {} validation images (standard error {:.2}): {verdict}",
-            self.candidate,
-            self.gain_db,
-            self.n_images,
-            self.standard_error_db,
-        );
+        log::info!("{self}: {verdict}");
+    }
+}
+
+impl std::fmt::Display for Trial {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let Self { candidate, gain_db, standard_error_db, n_images, .. } = self;
+        write!(
+            f,
+            "{candidate}: {gain_db:+.2} dB on {n_images} validation images (standard error {standard_error_db:.2})"
+        )
     }
 }
 
 /// Result of a trial on validation images, for reports.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct TrialReport {
-    /// Description of the tested part of the model: the addition, or what the reduction would remove.
+    /// Description of the tested part of the model: the addition, or the part that the reduction would remove.
     pub candidate: String,
-    /// Mean PSNR with that part minus that without it, dB.
+    /// Mean PSNR with that part minus mean PSNR without it, dB.
     pub gain_db: f64,
     /// Standard error of the mean, dB.
     pub standard_error_db: f64,

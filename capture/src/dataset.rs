@@ -13,16 +13,16 @@ use std::sync::{Arc, OnceLock};
 /// Name of the only camera of a dataset.
 const CAMERA: &str = "camera";
 
-/// The photos of a dataset as keyframes, undistorted and scaled, with poses as in the dataset.
+/// The photos of a dataset as keyframes: undistorted and scaled, with the poses of the dataset.
 #[derive(Debug)]
 pub struct LoadedDataset {
-    /// In the order of the dataset.
+    /// Keyframes, in the order of the dataset.
     pub keyframes: Vec<Arc<Keyframe>>,
     /// Names of the photos, in the same order.
     pub names: Vec<String>,
     /// Notes for the user.
     pub notes: Vec<String>,
-    /// Files that did not decode.
+    /// Messages about files that did not decode.
     pub data_losses: Vec<String>,
 }
 
@@ -98,7 +98,7 @@ pub fn load(
 /// Undistortion maps of one lens; empty for a lens without distortion.
 struct LensMaps {
     color: Option<Undistortion>,
-    /// For depth images whose size differs from that of the photos; computed for the first such image.
+    /// Map for depth images whose size differs from that of the photos; computed for the first such image.
     depth: OnceLock<Undistortion>,
 }
 

@@ -32,9 +32,9 @@ pub(crate) fn intrinsics(full: &Intrinsics, share: f64) -> Result<Intrinsics, Er
     Ok(scaled)
 }
 
-/// Scales an image `[height, width, 4]` with alpha from the size `from_px`, width and height, to the smaller `to_px`.
+/// Scales an image `[height, width, 4]` with alpha from `from_px` (width and height) to the smaller size `to_px`.
 ///
-/// The color is unchanged if the sizes are equal. A new pixel is masked (alpha 0) if any pixel it covers is masked, so
+/// If the sizes are equal, the color is unchanged. A new pixel is masked (alpha 0) if it covers any masked pixel, so
 /// that no masked content leaks into the result.
 #[must_use]
 pub fn rgba(rgba: Vec<u8>, from_px: [u32; 2], to_px: [u32; 2]) -> Vec<u8> {

@@ -8,18 +8,18 @@ use std::fmt::{Display, Formatter};
 /// The result of a fallible operation of this crate.
 pub type Result<T, E = Error> = std::result::Result<T, E>;
 
-/// Why a rig cannot be opened, read or joined.
+/// An error of opening or reading a rig, or of joining its samples.
 ///
 /// [`Error::class`] distinguishes invalid input, insufficient data and failures. The message of the error is its
 /// outermost context; `{:#}` gives the message with all causes.
 #[derive(Debug)]
 #[non_exhaustive]
 pub enum Error {
-    /// The arguments, or a file they name, are invalid.
+    /// The arguments, or a file that they name, are invalid.
     BadInput(String),
     /// The input is not sufficient for a result.
     InsufficientData(String),
-    /// Something failed.
+    /// An operation failed.
     Failed(String),
     /// The rig file is invalid.
     Config(ConfigError),
@@ -31,19 +31,19 @@ pub enum Error {
     Kinematics(kinematics::Error),
     /// A file cannot be read or written.
     Io(std::io::Error),
-    /// An error of another library.
+    /// An error from another library.
     Other(Box<dyn StdError + Send + Sync>),
     /// The operation that failed, with the cause.
     Context {
-        /// What was being done, or the file, device or image concerned.
+        /// The operation, or the file, device or image concerned.
         context: String,
-        /// Why it failed.
+        /// The cause.
         source: Box<Self>,
     },
 }
 
 impl Error {
-    /// What the error means for the caller.
+    /// Class of the error, for the exit code.
     #[must_use]
     pub fn class(&self) -> ErrorClass {
         match self {
@@ -57,13 +57,13 @@ impl Error {
         }
     }
 
-    /// An error of a library that is not part of this interface.
+    /// Wraps an error of a library that is not part of this interface.
     pub(crate) fn other(error: impl StdError + Send + Sync + 'static) -> Self {
         Self::Other(Box::new(error))
     }
 }
 
-/// Writes the message; in the alternate form `{:#}`, followed by those of all causes.
+/// Writes the message. The alternate form `{:#}` appends the messages of all causes.
 impl Display for Error {
     fn fmt(&self, f: &mut Formatter<'_>) -> std::fmt::Result {
         match self {

@@ -1,49 +1,70 @@
-//! The input side of a run: a thread reads the source, records, joins and corrects base poses at stations. Keyframes
-//! come out of a bounded queue.
+//! The input side of a run: a thread reads the source, records and joins the samples, and corrects base poses at
+//! stations. Keyframes are delivered through a bounded queue.
 
 use crate::error::{Context, Error};
 use crate::join::{Change, Join, JoinEvent, PosedImage};
+use crate::stamp_clock::StampClock;
 use crate::stations::Stations;
 use crate::stop::Stop;
 use drivers::recording::Recorder;
-use drivers::{PixelFormat, Sample, Source, clock};
+use drivers::{PixelFormat, Sample, Source};
 use kinematics::{Stamp, Transform};
 use parking_lot::Mutex;
-use std::collections::{BTreeMap, HashMap};
+use std::collections::{BTreeMap, HashMap, VecDeque};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel};
 use std::sync::{Arc, OnceLock};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-/// Maximum number of keyframes that wait for the trainer. When the queue is full, the source waits too, and live
-/// devices drop (and count) images.
+/// Maximum number of keyframes that wait for the trainer. If the queue is full, the input thread waits, and live
+/// devices drop and count images.
 const MAX_WAITING: usize = 8;
 
-/// A live image that appears to be older than this was stamped by another clock, such as a simulator's.
-const MAX_LIVE_AGE_SECS: f64 = 60.0;
+/// Number of images whose arrival is remembered until they become keyframes: more than a station holds back.
+const MAX_ARRIVALS: usize = 512;
+
+/// When a keyframe passed the stages of the input.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct InputTimes {
+    /// Mid-exposure of its image; `None` if the stamp is on another clock.
+    pub captured: Option<Instant>,
+    /// Its image was returned by the driver.
+    pub arrived: Instant,
+    /// It was accepted and queued for training.
+    pub queued: Instant,
+}
+
+/// A change of the keyframes that comes out of a [`Feed`].
+#[derive(Debug)]
+pub struct FeedItem {
+    /// The change.
+    pub change: Change,
+    /// Times of an accepted keyframe.
+    pub times: Option<InputTimes>,
+}
 
 /// Receives the camera images of a running input, for example to show them.
 pub trait ImageObserver: Send {
     /// Whether images are needed. If not, they are not decoded.
     fn needs_images(&self) -> bool;
 
-    /// Takes an image.
+    /// Receives an image.
     fn observe(&self, image: ObservedImage);
 }
 
-/// A camera image with its pose, as it arrived.
+/// A camera image as received from the device, with its pose.
 #[derive(Clone, Debug)]
 pub struct ObservedImage {
     /// Name of the camera.
     pub camera: Arc<str>,
     /// Mid-exposure.
     pub stamp: Stamp,
-    /// The same moment on this process's clock; the time of arrival if the stamp is on another clock.
+    /// Mid-exposure on this process's clock; the time of arrival if the stamp comes from another clock.
     pub captured_at: Instant,
     /// Width and height, pixels.
     pub size_px: [u32; 2],
-    /// The image, not undistorted.
+    /// The pixels, not undistorted.
     pub pixels: ObservedPixels,
     /// Pose of the camera at the stamp, with the correction of its station.
     pub world_from_camera: Transform,
@@ -62,7 +83,7 @@ pub enum ObservedPixels {
     Rgb(Arc<[u8]>),
 }
 
-/// State of the input that the run reads while it runs.
+/// State of the input that the run reads while the input thread runs.
 #[derive(Debug, Default)]
 struct Shared {
     first_image: OnceLock<Instant>,
@@ -74,19 +95,19 @@ struct Shared {
 pub struct Input {
     /// The open devices or recording.
     pub source: Box<dyn Source>,
-    /// Makes keyframes of the samples.
+    /// Makes keyframes from the samples.
     pub join: Join,
     /// Corrects base poses at stations, if the base moves.
     pub stations: Option<Stations>,
-    /// Records all samples, if they are recorded.
+    /// Records all samples; `None` if the run is not recorded.
     pub recorder: Option<Recorder>,
-    /// Whether devices are read in real time. The stamps of a recording are from another time.
-    pub is_live: bool,
+    /// The clock of the stamps.
+    pub stamp_clock: StampClock,
     /// Focal length and principal point of every camera, pixels.
     pub camera_intrinsics: HashMap<Arc<str>, ([f64; 2], [f64; 2])>,
 }
 
-/// The input after it ended.
+/// Results of an input that has ended.
 pub struct InputResult {
     /// The join with its keyframes and counts.
     pub join: Join,
@@ -100,14 +121,14 @@ pub struct InputResult {
 
 /// The running input.
 pub struct Feed {
-    changes: Receiver<Change>,
+    changes: Receiver<FeedItem>,
     shared: Arc<Shared>,
     thread: JoinHandle<InputResult>,
     ended: bool,
 }
 
 impl Feed {
-    /// Starts to read `input`. The feed ends when the input ends, at `stop`, or at an error of the source.
+    /// Starts reading `input`. The feed ends when the input ends, when `stop` is requested, or when the source fails.
     ///
     /// # Errors
     ///
@@ -115,13 +136,13 @@ impl Feed {
     pub fn start(input: Input, observer: Box<dyn ImageObserver>, stop: Stop) -> crate::Result<Self> {
         let (sender, changes) = sync_channel(MAX_WAITING);
         let shared = Arc::new(Shared::default());
-        let pump = Pump { input, observer, stop, sender, shared: shared.clone() };
+        let pump = Pump { input, observer, stop, sender, shared: shared.clone(), arrivals: VecDeque::new() };
         let thread =
             std::thread::Builder::new().name("input".into()).spawn(|| pump.run()).context("cannot start a thread")?;
         Ok(Self { changes, shared, thread, ended: false })
     }
 
-    /// Time at which the first image arrived; `None` before.
+    /// Time at which the first image arrived; `None` if none has arrived.
     #[must_use]
     pub fn first_image(&self) -> Option<Instant> {
         self.shared.first_image.get().copied()
@@ -133,10 +154,10 @@ impl Feed {
         self.shared.rejected.lock().clone()
     }
 
-    /// Waits at most `timeout` for the next change; `None` if there is none yet or the input has ended.
-    pub fn next(&mut self, timeout: Duration) -> Option<Change> {
+    /// Waits at most `timeout` for the next change. Returns `None` if none arrived or the input has ended.
+    pub fn next(&mut self, timeout: Duration) -> Option<FeedItem> {
         match self.changes.recv_timeout(timeout) {
-            Ok(change) => Some(change),
+            Ok(item) => Some(item),
             Err(RecvTimeoutError::Timeout) => None,
             Err(RecvTimeoutError::Disconnected) => {
                 self.ended = true;
@@ -173,11 +194,13 @@ struct Pump {
     input: Input,
     observer: Box<dyn ImageObserver>,
     stop: Stop,
-    sender: SyncSender<Change>,
+    sender: SyncSender<FeedItem>,
     shared: Arc<Shared>,
+    /// The latest color images: camera, stamp, and when the driver returned them.
+    arrivals: VecDeque<(Arc<str>, Stamp, Instant)>,
 }
 
-/// The trainer accepts no more keyframes.
+/// The trainer has ended and accepts no more keyframes.
 struct TrainerGone;
 
 impl Pump {
@@ -201,8 +224,12 @@ impl Pump {
                 log::error!("the recording ends here, the run continues: {error:#}");
                 recording_error = Some(error);
             }
-            if matches!(sample, Sample::Image(_)) {
+            if let Sample::Image(image) = &sample {
                 self.shared.first_image.get_or_init(Instant::now);
+                if !image.is_depth() {
+                    self.arrivals.push_back((image.camera.clone(), image.stamp, Instant::now()));
+                    self.arrivals.drain(..self.arrivals.len().saturating_sub(MAX_ARRIVALS));
+                }
             }
             let newest = sample.stamp();
             let events = self.input.join.push(sample);
@@ -256,7 +283,21 @@ impl Pump {
     }
 
     fn send(&self, changes: Vec<Change>) -> Result<(), TrainerGone> {
-        changes.into_iter().try_for_each(|change| self.sender.send(change).map_err(|_| TrainerGone))
+        changes.into_iter().try_for_each(|change| {
+            let times = self.times(&change);
+            self.sender.send(FeedItem { change, times }).map_err(|_| TrainerGone)
+        })
+    }
+
+    /// Times of an accepted keyframe. Its stamp differs from its image's by the offsets in the rig file, so its image is
+    /// the one closest in time.
+    fn times(&self, change: &Change) -> Option<InputTimes> {
+        let Change::Accepted(keyframe) = change else { return None };
+        let images = self.arrivals.iter().filter(|(camera, ..)| *camera == keyframe.camera);
+        let distance = |stamp: Stamp| self.input.join.shifted(stamp).0.abs_diff(keyframe.stamp.0);
+        let &(_, stamp, arrived) = images.min_by_key(|(_, stamp, _)| distance(*stamp))?;
+        let captured = self.input.stamp_clock.instant_of(stamp);
+        Some(InputTimes { captured, arrived, queued: Instant::now() })
     }
 
     /// Passes a camera image to the observer.
@@ -297,12 +338,6 @@ impl Pump {
 
     /// Time at which an image was captured, or now if its stamp is on another clock (recordings, simulations).
     fn captured_at(&self, stamp: Stamp) -> Instant {
-        let now = Instant::now();
-        let age_secs = clock::now().secs_since(stamp);
-        if self.input.is_live && (0.0..MAX_LIVE_AGE_SECS).contains(&age_secs) {
-            now.checked_sub(Duration::from_secs_f64(age_secs)).unwrap_or(now)
-        } else {
-            now
-        }
+        self.input.stamp_clock.instant_of(stamp).unwrap_or_else(Instant::now)
     }
 }

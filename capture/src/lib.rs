@@ -3,8 +3,9 @@
 //! A [`Rig`] is a checked rig file. [`open::rig`] opens its devices, real or simulated, and [`open::recording`] a
 //! recording, as one source of samples. A [`Join`] turns the samples into keyframes: it pairs each image with the pose
 //! of its camera at mid-exposure, rejects images that are blurred, badly exposed or too close to others, and bounds the
-//! memory. [`Stations`] corrects the drift of a moving base. [`Feed`] does all of this on a thread of its own.
-//! [`dataset`] loads datasets with known poses instead.
+//! memory. [`Stations`] corrects the drift of a moving base. [`Feed`] does all of this on a separate thread.
+//! [`dataset`] loads datasets with known poses instead. [`doctor`] checks whether this computer and its devices are
+//! ready.
 //!
 //! ```
 //! use capture::{Join, Rig};
@@ -29,11 +30,13 @@
 
 pub mod config;
 pub mod dataset;
+pub mod doctor;
 pub mod downscale;
 mod error;
 mod feed;
 mod join;
 pub mod open;
+mod stamp_clock;
 mod stations;
 mod stop;
 #[cfg(test)]
@@ -42,7 +45,8 @@ mod test_data;
 
 pub use config::{ConfigError, Override, Rig};
 pub use error::{Error, Result};
-pub use feed::{Feed, ImageObserver, Input, InputResult, ObservedImage, ObservedPixels};
+pub use feed::{Feed, FeedItem, ImageObserver, Input, InputResult, InputTimes, ObservedImage, ObservedPixels};
 pub use join::{Change, Counts, Join, JoinEvent, PosedImage, Rejection, SampleUse};
+pub use stamp_clock::StampClock;
 pub use stations::{StationReport, Stations};
 pub use stop::Stop;

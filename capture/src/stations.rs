@@ -1,10 +1,10 @@
 //! Corrects the pose of a moving base at each station by registering its images there with those of earlier stations.
 //!
-//! Keyframes pass through on their way from the join to the trainer. Those of the first station pass unchanged. After
-//! that, keyframes taken while the base moves and the first ones of the next station are queued until the station can
-//! be registered with earlier ones ([`calibration::register_station`]). Then they and all later ones pass with the
-//! correction. The result depends only on the keyframes and their order, so that a run, its recording and the replay of
-//! that recording agree; only the time at which keyframes pass depends on a clock.
+//! Keyframes pass through this module on their way from the join to the trainer. Keyframes of the first station pass
+//! unchanged. After that, keyframes taken while the base moves and the first keyframes of the next station are queued
+//! until the station can be registered with earlier ones ([`calibration::register_station`]). Then they and all later
+//! keyframes pass with the correction. The result depends only on the keyframes and their order, so that a run, its
+//! recording and the replay of that recording agree; only the time at which keyframes pass depends on a clock.
 
 use crate::config::{BaseDriver, Parent, Rig};
 use crate::join::Change;
@@ -17,12 +17,12 @@ use std::sync::Arc;
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-/// Number of keyframes with depth, excluding test keyframes, for registering a station. A few seconds of scanning give
-/// them.
+/// Number of keyframes with depth, excluding test keyframes, with which a station is registered. A scan of a few
+/// seconds gives so many.
 const MIN_KEYFRAMES: usize = 14;
 /// Maximum time to wait for that many keyframes, seconds.
 const MAX_SCAN_SECS: f64 = 10.0;
-/// Maximum time to wait for a station while the base moves, seconds. After it, or with [`MAX_HELD`] queued keyframes,
+/// Maximum time to wait for a station while the base moves, seconds. Afterwards, or with [`MAX_HELD`] queued keyframes,
 /// the queued keyframes get the correction of the previous station.
 const MAX_TRAVEL_SECS: f64 = 30.0;
 const MAX_HELD: usize = 128;
@@ -61,7 +61,7 @@ struct SearchResult {
     took: Duration,
 }
 
-/// Report on a station after the first; serialized for run reports, printed as one line.
+/// Report on a station after the first. It is serialized in run reports and printed as one line.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct StationReport {
     /// Index of the station, counted from 0.
@@ -166,7 +166,7 @@ impl Stations {
         released.into_iter().filter_map(keyframe).collect()
     }
 
-    /// Corrects the current pose of a camera, given its pose according to the reported base pose.
+    /// Applies the current correction to the pose of a camera that was computed from the reported base pose.
     pub(crate) fn corrected_pose(&self, camera: &str, world_from_camera: &Transform) -> Transform {
         if self.carried.contains(camera) { self.map_from_odom * world_from_camera } else { *world_from_camera }
     }
@@ -228,7 +228,7 @@ impl Stations {
         }
     }
 
-    /// Whether a keyframe is at the current station or independent of the base.
+    /// Whether a keyframe was taken at the current station or does not depend on the base.
     fn is_at_current_station(&self, keyframe: &Keyframe) -> bool {
         match &keyframe.base {
             None => true,
@@ -288,7 +288,7 @@ impl Stations {
         }));
     }
 
-    /// Passes the queued keyframes with the correction found by registration.
+    /// Passes the queued keyframes on with the correction that registration estimated.
     fn apply_result(&mut self, SearchResult { correction, took }: SearchResult, released: &mut Vec<Change>) {
         self.spent += took;
         let base_state = self.group().next().and_then(|keyframe| keyframe.base.clone());

@@ -6,18 +6,18 @@ use std::sync::atomic::{AtomicBool, Ordering};
 /// Whether a stop was requested. Clones share the state.
 #[derive(Clone, Debug, Default)]
 pub struct Stop {
-    /// By the program itself.
+    /// Set if the program requested the stop.
     requested: Arc<AtomicBool>,
-    /// By a signal.
+    /// Set if a signal requested the stop.
     signaled: Arc<AtomicBool>,
     /// Whether the signal was logged.
     logged: Arc<AtomicBool>,
-    /// The message to log then.
+    /// Message that is logged after a signal.
     message: &'static str,
 }
 
 impl Stop {
-    /// A stop that is also requested by setting the returned flag, which a signal handler may do; the next query then
+    /// Creates a stop and a flag that a signal handler may set. Setting the flag requests the stop; the next query then
     /// logs the message.
     #[must_use]
     pub fn with_signal_flag(message: &'static str) -> (Self, Arc<AtomicBool>) {

@@ -1,4 +1,4 @@
-//! The monotonic clock of all stamps.
+//! The monotonic clock from which all stamps come.
 
 use kinematics::Stamp;
 use std::time::Duration;
@@ -9,7 +9,7 @@ pub fn now() -> Stamp {
     read(rustix::time::ClockId::Monotonic)
 }
 
-/// Current time of a clock that includes suspend. Use it only to detect that the computer was suspended.
+/// Current time of a clock that keeps counting while the computer is suspended. Use it only to detect a suspend.
 #[cfg(target_os = "linux")]
 pub(crate) fn now_including_suspend() -> Stamp {
     read(rustix::time::ClockId::Boottime)

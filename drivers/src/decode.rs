@@ -45,7 +45,7 @@ impl Image {
     }
 
     /// Decodes a depth image to `[height, width]`, meters along the camera's z axis; 0 if the depth is unknown. The
-    /// largest count means out of range and is also unknown.
+    /// largest count means that the depth is out of range; it is also decoded to 0.
     pub fn decode_depth_m(&self) -> Result<Vec<f32>, Error> {
         let PixelFormat::DepthU16 { meters_per_count } = self.format else {
             return Err(self.wrong_kind("depth"));
@@ -58,7 +58,7 @@ impl Image {
         Ok(self.raw_bytes()?.chunks_exact(2).map(meters_from_count).collect())
     }
 
-    /// Removes the padding that a device adds after each row and after the last one.
+    /// Removes the padding that a device adds after each row, including the last.
     ///
     /// `bytes_per_line` is the distance between the starts of two rows (`bytesperline` of V4L2; chroma rows have the
     /// same stride). Compressed images are returned unchanged.
@@ -82,7 +82,7 @@ impl Image {
         Ok(self)
     }
 
-    /// Data of an uncompressed image, after checking its length.
+    /// Checks the length of the data of an uncompressed image, and returns the data.
     pub(crate) fn raw_bytes(&self) -> Result<&[u8], Error> {
         let expected_bytes = self
             .format
@@ -104,7 +104,7 @@ impl Image {
         let (camera, stamp) = (self.camera.to_string(), self.stamp);
         let decode = |expected_px: [u32; 2]| {
             let file = first_complete(&self.data, format)?;
-            // Check the size first: a few bytes can declare a huge image that takes seconds to decode.
+            // The size is checked first, because a few bytes can declare a huge image that takes seconds to decode.
             let got_px: [u32; 2] = ImageReader::with_format(Cursor::new(&*file), format).into_dimensions()?.into();
             let is_expected = got_px == expected_px;
             let rgb = is_expected.then(|| image::load_from_memory_with_format(&file, format)).transpose()?;
@@ -122,8 +122,8 @@ impl Image {
     }
 }
 
-/// Decodes an image of a given or guessed format. From JPEG data, the first complete image is used; a truncated one is
-/// an error, whereas decoders fill the missing part with gray.
+/// Decodes an image of a given or guessed format. From JPEG data, the first complete image is used. A truncated image
+/// is an error here, whereas decoders fill the missing part with gray.
 pub(crate) fn decode_complete(bytes: &[u8], format: Option<ImageFormat>) -> Result<DynamicImage, ImageError> {
     let format = format.map_or_else(|| image::guess_format(bytes), Ok)?;
     image::load_from_memory_with_format(&first_complete(bytes, format)?, format)
@@ -248,7 +248,7 @@ mod tests {
         assert!(matches!(short, Err(Error::ImageLength { got_bytes: 3, expected_bytes: 6, .. })));
         let other_size = image(PixelFormat::Png, [2, 2], &png_of([2, 1], &[0; 6])).decode_rgb();
         assert!(matches!(other_size, Err(Error::ImageSize { got_px: [2, 1], .. })));
-        // Only the header of an image that would take gigabytes.
+        // The header alone declares an image that would take gigabytes.
         let mut huge = file_of(ImageFormat::Jpeg, [2, 1], &[0; 6]);
         let frame = huge.windows(2).position(|pair| pair == [0xff, 0xc0]).expect("a frame header");
         huge[frame + 5..frame + 9].copy_from_slice(&[0x3f, 0xff, 0x3f, 0xff]);

@@ -52,13 +52,13 @@ pub enum Error {
         /// Description of the problem.
         problem: Box<crate::realsense::Problem>,
     },
-    /// The file that a camera is played back from has ended.
+    /// The recorded file that replaces a camera has ended.
     #[error("camera {camera:?}: its file has ended")]
     Ended {
         /// Name in the rig file.
         camera: String,
     },
-    /// The next image of a file that is played back is due later. A later call returns it.
+    /// The next image of a recorded file is due later. A later call returns it.
     #[error("camera {camera:?}: the next image of its file is due in {remaining:?}")]
     NotDue {
         /// Name in the rig file.
@@ -237,13 +237,13 @@ pub enum Error {
         /// "color" or "depth".
         expected: &'static str,
     },
-    /// A file that is not a recording.
+    /// The file is not a recording.
     #[error("{path:?} is not a recording: it does not start with the MCAP magic bytes")]
     NotARecording {
         /// The file.
         path: PathBuf,
     },
-    /// A recording without samples of a rig.
+    /// The recording contains no samples of a rig.
     #[error("the recording {path:?} contains no images or joint states recorded by this program")]
     EmptyRecording {
         /// The file.
@@ -304,9 +304,9 @@ pub enum Error {
         path: PathBuf,
         /// Number of missing images.
         n_missing: usize,
-        /// Number of images that are broken or have no pose.
+        /// Number of images that are corrupt or have no pose.
         n_unusable: usize,
-        /// First of these with its reason, in parentheses; empty if there is none.
+        /// The first unusable image with the reason, in parentheses; empty if there is none.
         first_reason: String,
     },
     /// The lens parameters of a TUM folder are unknown.

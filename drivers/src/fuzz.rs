@@ -3,8 +3,8 @@
 //! Long fuzzing runs use the targets in the folder `fuzz`. The tests here replay its seeds, both unchanged and
 //! corrupted at random. A seed is exactly the input of its function.
 //!
-//! Targets of a device family are beside its code. `input` reads values from the bytes, and `scratch` provides folders
-//! for targets that read files.
+//! The target of a device family is in the folder of that family. `input` reads values from the bytes, and `scratch`
+//! provides folders for targets that read files.
 
 mod dataset;
 pub(crate) mod input;

@@ -5,7 +5,7 @@
 
 use std::borrow::Cow;
 
-/// Why a buffer contains no complete JPEG image.
+/// The reason why a buffer contains no complete JPEG image.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum JpegError {
@@ -24,14 +24,14 @@ const START_OF_IMAGE: u8 = 0xd8;
 const END_OF_IMAGE: u8 = 0xd9;
 const START_OF_SCAN: u8 = 0xda;
 const HUFFMAN_TABLES: u8 = 0xc4;
-/// Baseline and extended sequential frames with Huffman coding: the ones that the standard tables can decode.
+/// Frame types that the standard tables can decode: baseline and extended sequential with Huffman coding.
 const SEQUENTIAL_FRAMES: [u8; 2] = [0xc0, 0xc1];
 
 /// Returns the first complete image of a buffer, from its first marker to its last. Adds the standard Huffman tables if
-/// it has none.
+/// the image has none.
 ///
-/// Bytes before and after the image are dropped, as are images truncated by the start of another one. A thumbnail
-/// inside a segment is part of the surrounding image. The image data is not decoded.
+/// Bytes before and after the image are dropped. Images that are truncated by the start of another image are dropped,
+/// too. A thumbnail inside a segment is part of the surrounding image. The image data is not decoded.
 pub fn first_image(buffer: &[u8]) -> Result<Cow<'_, [u8]>, JpegError> {
     let mut reason = JpegError::NoStartMarker;
     let mut start = 0;
@@ -68,7 +68,7 @@ struct ImageExtent {
     end: usize,
     /// Index of the marker of its first scan.
     first_scan: usize,
-    /// Whether it lacks Huffman tables before the first scan and the standard ones fit.
+    /// Whether the image has no Huffman tables before its first scan, and its frame type fits the standard tables.
     needs_tables: bool,
 }
 
@@ -80,7 +80,7 @@ fn scan_markers(buffer: &[u8], start: usize) -> Result<ImageExtent, (JpegError, 
     let mut has_tables = false;
     let mut is_sequential = false;
     loop {
-        // This also skips coded data, in which 0 follows each 0xff, and stray bytes.
+        // This also skips stray bytes, and coded data, in which 0 follows each 0xff.
         let (marker_at, marker) = next_marker(buffer, position).ok_or((JpegError::Truncated, buffer.len()))?;
         position = marker_at + 2;
         match (marker, first_scan) {

@@ -22,6 +22,8 @@ mod error;
 pub mod franka;
 #[cfg(any(test, fuzzing))]
 pub mod fuzz;
+#[cfg(feature = "nokhwa")]
+mod gap_estimator;
 pub mod jpeg;
 mod live;
 pub mod motion;
@@ -29,7 +31,10 @@ pub mod motion;
 pub mod nokhwa;
 #[cfg(any(target_os = "linux", feature = "nokhwa", feature = "realsense"))]
 mod outage;
+mod playback;
 pub mod realsense;
+#[cfg(any(target_os = "linux", feature = "nokhwa", feature = "realsense"))]
+mod reconnecting;
 pub mod recording;
 mod sample;
 pub mod tags;
@@ -44,6 +49,9 @@ mod yuv;
 pub use error::{Error, RecordedSpan};
 pub use live::{Devices, Live};
 pub use motion::MovableArm;
+pub use playback::{Playback, PlaybackClock};
+#[cfg(any(target_os = "linux", feature = "nokhwa", feature = "realsense"))]
+pub use reconnecting::CameraCounts;
 pub use sample::{BasePose, Image, PixelFormat, RangePoint, RangeScan, Sample, TruthImage};
 pub use yuv::{V4l2Colors, YuvColors, YuvLayout, YuvMatrix, YuvRange};
 
@@ -65,8 +73,8 @@ pub trait Camera: Send {
     /// reconnect to the camera. Cameras played back from a file return [`Error::NotDue`] if the next image is due
     /// later, and [`Error::Ended`] at the end.
     fn next_image(&mut self, timeout: Duration) -> Result<Image, Error>;
-    /// Whether the source waits for a slow caller instead of dropping images, for example a file that is read as fast
-    /// as possible.
+    /// Whether the camera waits for a slow caller instead of dropping images. True, for example, for a file that is
+    /// read as fast as possible.
     fn waits_for_caller(&self) -> bool {
         false
     }

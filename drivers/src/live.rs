@@ -13,7 +13,7 @@ const MAX_IMAGES: usize = 8;
 const MAX_JOINTS: usize = 1000;
 /// Queue capacity of a range scanner, in scans.
 const MAX_SCANS: usize = 20;
-/// A device without samples for this long is an error.
+/// A device that delivers no samples for this long causes an error.
 const MAX_SILENCE: Duration = Duration::from_secs(5);
 /// Duration of one wait on a device. It bounds the time until its thread notices that it has to stop.
 const POLL: Duration = Duration::from_millis(100);
@@ -31,15 +31,15 @@ pub struct Devices {
     pub scanners: Vec<Box<dyn RangeScanner>>,
 }
 
-/// All devices of a rig, each read by its own thread.
+/// A source that reads all devices of a rig, each in its own thread.
 ///
 /// If the caller is too slow, the oldest samples of a device are dropped. Dropped images are counted in
 /// [`Image::n_skipped`] of the next image of the same kind, all other samples in [`Source::n_other_samples_dropped`].
 /// Cameras that wait for their caller are blocked instead.
 ///
 /// The first error of a device ends the source; [`Source::next_sample`] returns it once. If cameras are played back
-/// from files, the end of the last camera also ends the source, after all samples read until then have been returned.
-/// Dropping it stops the threads.
+/// from files, the end of the last file also ends the source, after all samples read until then have been returned.
+/// Dropping the source stops the threads.
 #[derive(Debug)]
 pub struct Live {
     shared: Arc<Shared>,
@@ -50,7 +50,7 @@ pub struct Live {
 struct Shared {
     state: Mutex<State>,
     arrived: Condvar,
-    /// Signaled when a sample was taken or all threads have to stop.
+    /// Signaled when a sample was taken or the threads have to stop.
     taken: Condvar,
 }
 
@@ -66,7 +66,7 @@ struct State {
     n_running: usize,
     /// Number of cameras whose images have not ended.
     n_cameras: usize,
-    /// Devices are no longer read. Queued samples may still be taken.
+    /// Whether devices are no longer read. Queued samples may still be taken.
     stop: bool,
 }
 
@@ -155,11 +155,11 @@ impl Live {
     }
 }
 
-/// Queue between a device and the caller.
+/// Policy of the queue between a device and the caller.
 #[derive(Clone, Copy)]
 struct QueuePolicy {
     capacity: usize,
-    /// If the queue is full: whether the device waits. Otherwise, its oldest sample is dropped.
+    /// Whether the device waits if the queue is full. If not, its oldest sample is dropped.
     blocks_device: bool,
 }
 
@@ -174,7 +174,7 @@ enum ReadOutcome {
     Sample(Sample),
     /// The device is connected but sent nothing.
     NoSample,
-    /// The driver is trying to reconnect, for a time that it limits itself, or the next image of a file is not due yet.
+    /// The driver is trying to reconnect for a limited time, or the next image of a file is not due yet.
     Pending,
     /// The file has ended.
     End,
@@ -242,7 +242,7 @@ impl State {
         self.queues[device_ix].push_back(sample);
     }
 
-    /// Adds a dropped image, and those dropped before it, to the count of the next image of its kind.
+    /// Adds a dropped image and the images dropped before it to the count of the next image of its kind.
     fn report_dropped(&mut self, device_ix: usize, dropped_image: &Image, newest: &mut Sample) {
         let same_kind = |sample: &&mut Sample| matches!(sample, Sample::Image(image) if image.is_depth() == dropped_image.is_depth());
         let pending = &mut self.dropped[device_ix][usize::from(dropped_image.is_depth())];
@@ -375,7 +375,7 @@ mod tests {
         while live.shared.state.lock().n_running > 0 {
             std::thread::yield_now();
         }
-        // Errors come first: samples that a broken device sent before are not worth waiting for.
+        // Errors come first: samples that a failed device sent earlier are not worth waiting for.
         assert!(live.next_sample().expect_err("the cable").to_string().contains("cable pulled"));
         let mut stamps = Vec::new();
         let mut n_skipped = [0; 2];
@@ -417,7 +417,7 @@ mod tests {
         while live.shared.state.lock().n_running > 0 {
             std::thread::yield_now();
         }
-        // The image comes after ten seconds of reconnecting. The error is the one after it.
+        // After ten seconds of reconnecting, the image arrives. The error follows it.
         assert!(live.next_sample().expect_err("the cable").to_string().contains("cable pulled"));
         assert_eq!(live.next_sample().expect("the error is returned only once").expect("an image").stamp(), Stamp(1));
     }

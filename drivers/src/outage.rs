@@ -1,7 +1,5 @@
-//! Outage of a camera: its start, the number of reconnection attempts, and the time of the next one. Shared by all
-//! camera drivers.
+//! Outage of a camera: its start, the number of reconnection attempts, and the time of the next one.
 
-#[cfg(any(target_os = "linux", feature = "realsense"))]
 use kinematics::Stamp;
 use std::time::{Duration, Instant};
 
@@ -22,8 +20,8 @@ impl Outage {
         *outage
     }
 
-    /// Waits until the next attempt is due, one pause after the last attempt, and counts it. If it is due after the
-    /// deadline, waits until the deadline and returns false.
+    /// Waits until the next attempt is due, one pause after the last attempt, and counts the attempt. If it is due
+    /// after the deadline, waits until the deadline and returns false.
     pub(crate) fn wait_for_retry(&mut self, pause: Duration, deadline: Instant) -> bool {
         let next_try = self.last_try + pause;
         std::thread::sleep(next_try.min(deadline).saturating_duration_since(Instant::now()));
@@ -37,7 +35,6 @@ impl Outage {
 }
 
 /// Number of images between two stamps at the given rate.
-#[cfg(any(target_os = "linux", feature = "realsense"))]
 pub(crate) fn n_between(last: Stamp, next: Stamp, rate_hz: f64) -> u64 {
     let periods = next.0.saturating_sub(last.0) as f64 * 1e-9 * rate_hz;
     #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "the cast saturates as intended")]
@@ -49,7 +46,6 @@ pub(crate) fn n_between(last: Stamp, next: Stamp, rate_hz: f64) -> u64 {
 mod tests {
     use super::*;
 
-    #[cfg(any(target_os = "linux", feature = "realsense"))]
     #[test]
     fn outage_duration_converts_to_missed_images() {
         let millis = |millis: i64| Stamp(millis * 1_000_000);

@@ -13,7 +13,7 @@ pub enum PixelFormat {
     Bgr8,
     /// One byte per pixel.
     Gray8,
-    /// Luma and chroma.
+    /// YUV: luma and chroma.
     Yuv {
         /// Memory layout.
         layout: YuvLayout,
@@ -36,7 +36,7 @@ pub enum PixelFormat {
 pub struct Image {
     /// Name of the camera in the rig file.
     pub camera: Arc<str>,
-    /// Mid-exposure, if the device reports it.
+    /// Time of the image: mid-exposure, if the device reports it.
     pub stamp: Stamp,
     /// Width and height, pixels.
     pub size_px: [u32; 2],
@@ -68,7 +68,7 @@ pub struct TruthImage {
     pub depth_m: Arc<[f32]>,
     /// True pose of the camera at mid-exposure of the middle row.
     pub world_from_camera: Transform,
-    /// PSNR in dB of the delivered image relative to the same image, with shear and blur, before noise was added;
+    /// PSNR in dB of the delivered image relative to the same image (including shear and blur) before noise was added;
     /// `None` without noise.
     pub psnr_ceiling: Option<f64>,
 }
@@ -91,8 +91,8 @@ pub struct RangeScan {
     pub scanner: Arc<str>,
     /// Start of the revolution.
     pub stamp: Stamp,
-    /// Points in the order of measurement. Each is in the sensor frame at its own time, since the scanner may move
-    /// during a scan.
+    /// Points in the order of measurement. Each point is expressed in the sensor frame at its own time, since the
+    /// scanner may move during a scan.
     pub points: Arc<[RangePoint]>,
 }
 

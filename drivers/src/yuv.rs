@@ -1,28 +1,28 @@
 //! Converts YUV images (luma and chroma) from cameras to red, green and blue.
 //!
 //! Source: ITU-R BT.601-7 and BT.709-6 (matrices, limited range), Linux `videodev2.h` (defaults, layouts). The transfer
-//! function is assumed to be that of sRGB: the one that cameras announce is rarely correct, and the difference is only
-//! a tone curve.
+//! function is assumed to be that of sRGB: the transfer function that cameras announce is rarely correct, and the
+//! difference is only a tone curve.
 
 use crate::Error;
 
-/// Memory layout of luma (Y) and chroma (U is blue, V is red); 8 bits each.
+/// Memory layout of luma (Y) and chroma (U for blue, V for red), 8 bits each.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum YuvLayout {
     /// `Y0 U Y1 V` for every two pixels of a row.
     Yuyv,
     /// `U Y0 V Y1` for every two pixels of a row.
     Uyvy,
-    /// All Y, in rows padded to an even width; then, for every two rows, one row with `U V` for every two pixels.
+    /// First all Y, in rows padded to an even width; then, for every two rows, one row with `U V` for every two pixels.
     Nv12,
 }
 
 /// Weights of red and blue in the luma.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum YuvMatrix {
-    /// Standard definition and webcams.
+    /// BT.601: standard definition and webcams.
     Bt601,
-    /// High definition.
+    /// BT.709: high definition.
     Bt709,
 }
 
@@ -219,7 +219,7 @@ mod tests {
         })
     }
 
-    /// CPU twin in f64, following the definition in the standards: chroma is `blue - luma` and `red - luma`, scaled.
+    /// CPU twin in f64 that follows the definition in the standards: chroma is `blue - luma` and `red - luma`, scaled.
     fn twin(colors: YuvColors, y: u8, u: u8, v: u8) -> [f64; 3] {
         let [red_weight, blue_weight] = colors.luma_weights();
         let [y, u, v] = [y, u, v].map(f64::from);

@@ -1,11 +1,15 @@
 //! Tests of writing and reading recordings: samples and their order are preserved, and damaged files are read as far as
 //! possible.
 
+mod recompress;
+
 use drivers::recording::{RIG_FILE, Recorder, Recording, RecordingMetadata};
 use drivers::{BasePose, Error, Image, PixelFormat, RangePoint, RangeScan, Sample, Source, TruthImage};
 use kinematics::random::Random;
 use kinematics::{Intrinsics, JointState, Lens, Stamp, Transform};
+use mcap::Compression;
 use nalgebra::{Translation3, UnitQuaternion};
+use recompress::recompress;
 use std::path::Path;
 
 const RIG: &str = "[arm]\ndriver = \"sim\"\n";
@@ -137,6 +141,45 @@ fn truncated_recording_yields_samples_before_the_cut() {
         n_before = read.len();
     }
     assert!(n_before > sent.len() / 2, "a cut near the end loses few samples: {n_before} of {}", sent.len());
+}
+
+/// Compressions that other programs use, with the sizes of their chunks.
+const COMPRESSIONS: [(Compression, u64); 4] =
+    [(Compression::Zstd, 2000), (Compression::Zstd, 4 << 20), (Compression::Lz4, 2000), (Compression::Lz4, 4 << 20)];
+
+#[test]
+fn recordings_compressed_by_other_programs_are_read() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("run.mcap");
+    let sent = samples();
+    record(&path, &sent);
+    let uncompressed = std::fs::read(&path).expect("the file");
+    for (compression, chunk_bytes) in COMPRESSIONS {
+        let compressed = recompress(&uncompressed, compression, chunk_bytes);
+        std::fs::write(&path, &compressed).expect("the file");
+        let (read, recording) = replay(&path);
+        assert!(read == sent, "{compression:?}, chunks of {chunk_bytes} bytes: {} samples", read.len());
+        assert_eq!(recording.damage(), None);
+        assert_eq!(recording.attachment(RIG_FILE), Some(RIG.as_bytes()));
+        assert_eq!(recording.joint_names(), Some(&["a".to_owned(), "b".to_owned()][..]));
+    }
+}
+
+#[test]
+fn truncated_compressed_recording_yields_samples_of_complete_chunks() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("run.mcap");
+    let sent = samples();
+    record(&path, &sent);
+    let uncompressed = std::fs::read(&path).expect("the file");
+    for compression in [Compression::Zstd, Compression::Lz4] {
+        let compressed = recompress(&uncompressed, compression, 20_000);
+        std::fs::write(&path, &compressed[..compressed.len() / 2]).expect("a shorter file");
+        let (read, recording) = replay(&path);
+        assert!(read.len() > sent.len() / 8 && read[..] == sent[..read.len()], "{} samples", read.len());
+        let damage = recording.damage().expect("the truncation is reported");
+        assert!(damage.contains("is truncated after"), "{damage}");
+    }
 }
 
 #[test]

@@ -1,9 +1,9 @@
-//! Context of errors: what was being done when something failed. The error types of other crates are built with it.
+//! Context of errors: the operation that failed. Macros for the error types of other crates.
 
 use std::error::Error;
 use std::fmt::Formatter;
 
-/// Writes the message of an error; in the alternate form `{:#}`, followed by those of its causes.
+/// Writes the message of an error. The alternate form `{:#}` appends the messages of its causes.
 ///
 /// # Errors
 ///
@@ -18,7 +18,7 @@ pub fn write_chain(f: &mut Formatter<'_>, error: &(dyn Error + 'static)) -> std:
     Ok(())
 }
 
-/// Converts errors of other types to variants of an error type that hold them.
+/// Implements conversions from errors of other types to the variants that hold them.
 #[macro_export]
 macro_rules! impl_from {
     ($error:ident: $($variant:ident($source:ty)),* $(,)?) => { $(
@@ -30,12 +30,12 @@ macro_rules! impl_from {
     )* };
 }
 
-/// Defines the trait `Context`, which adds to an error what was being done. The error type of the calling crate needs
+/// Defines the trait `Context`, which adds the failed operation to an error. The error type of the calling crate needs
 /// the variants `Context { context: String, source: Box<Self> }` and `Failed(String)`.
 #[macro_export]
 macro_rules! define_context {
     ($error:ident) => {
-        /// Adds to an error what was being done.
+        /// Adds the failed operation to an error.
         pub trait Context<T>: Sized {
             /// Adds a context that is computed only after a failure.
             ///
@@ -68,20 +68,20 @@ macro_rules! define_context {
     };
 }
 
-/// A failure of the calling crate, with a formatted message.
+/// Creates the error `Failed` of the calling crate, with a formatted message.
 #[macro_export]
 #[expect(clippy::crate_in_macro_def, reason = "the error type is that of the calling crate")]
 macro_rules! failed {
     ($($message:tt)*) => { crate::Error::Failed(format!($($message)*)) };
 }
 
-/// Returns a failure of the calling crate, with a formatted message.
+/// Returns the error `Failed` of the calling crate, with a formatted message.
 #[macro_export]
 macro_rules! bail {
     ($($message:tt)*) => { return Err($crate::failed!($($message)*)) };
 }
 
-/// Returns a failure of the calling crate unless the condition holds.
+/// Returns the error `Failed` of the calling crate unless the condition holds.
 #[macro_export]
 macro_rules! ensure {
     ($condition:expr, $($message:tt)*) => {

@@ -1,4 +1,4 @@
-//! Counts and lists in messages.
+//! Formats counts and lists for messages.
 
 /// A count and its noun: `1 image`, `2 images`.
 #[must_use]

@@ -44,10 +44,10 @@ pub enum Error {
     List {
         /// The file.
         path: PathBuf,
-        /// What is wrong, with the line.
+        /// Description of the problem, with the line.
         reason: String,
     },
-    /// A list of keyframes has none in common with the data.
+    /// A list of keyframes has no keyframe in common with the data.
     #[error("the keyframe list matches nothing in the data: it lists {listed}, the data has {found}")]
     NoListedKeyframe {
         /// Camera and stamp of a listed keyframe.
@@ -58,15 +58,15 @@ pub enum Error {
     /// Test images cannot be selected as requested.
     #[error("--holdout {request}: {reason}")]
     Holdout {
-        /// The number, file or name.
+        /// The requested number, file or name.
         request: String,
-        /// What is wrong.
+        /// Description of the problem.
         reason: String,
     },
 }
 
 impl Error {
-    /// What the error means for the caller.
+    /// Class of the error, for the exit code.
     #[must_use]
     pub fn class(&self) -> ErrorClass {
         match self {

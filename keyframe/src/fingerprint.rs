@@ -1,10 +1,9 @@
-//! Fingerprint of the keyframe data that affect a model: a different fingerprint means a different model.
+//! Fingerprint of the keyframe data that affect a model.
 
 use crate::{DepthMap, Keyframe};
 use kinematics::Twist;
 
-/// Fingerprint of pixels, depth, intrinsics, pose, velocity and joint twists. The split and ground truth of a simulator
-/// are excluded.
+/// Fingerprint of pixels, depth, intrinsics, pose, velocity and joint twists, without the split and ground truth.
 #[must_use]
 pub fn fingerprint(keyframe: &Keyframe) -> u64 {
     let mut hash = Hash::default();
@@ -21,7 +20,7 @@ pub fn fingerprint(keyframe: &Keyframe) -> u64 {
     hash.0
 }
 
-/// Hashes eight bytes at a time, so that it is faster than the rate of images.
+/// A hash that processes eight bytes at a time, which is fast enough for live images.
 struct Hash(u64);
 
 impl Default for Hash {

@@ -1,4 +1,4 @@
-//! Selects which photos of a dataset are excluded from training, and for what.
+//! Selects the photos of a dataset that are used for testing and validation.
 
 use crate::{Error, Split};
 use std::path::Path;
@@ -23,7 +23,7 @@ impl Holdout {
     ///
     /// # Errors
     ///
-    /// If it is neither a number from 1 nor a readable file with at least one name.
+    /// If the argument is neither a number of at least 1 nor a readable file with at least one name.
     pub fn from_argument(argument: &str) -> Result<Self, Error> {
         let invalid = |reason: &str| Error::Holdout { request: argument.to_owned(), reason: reason.to_owned() };
         if let Ok(every) = argument.parse::<i64>() {

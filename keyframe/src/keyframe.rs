@@ -8,17 +8,17 @@ use std::sync::Arc;
 /// How a keyframe may be used.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Split {
-    /// For training.
+    /// Used for training.
     Train,
-    /// For deciding hyperparameters and trials; then for training.
+    /// Used to decide hyperparameters and trials, and afterwards for training.
     Validation,
-    /// For reporting only.
+    /// Used only for reported scores.
     Test,
 }
 
 impl Split {
-    /// The split of the `ix`-th keyframe of a camera in order: every 8th from 0 is for testing, every 8th from 4 for
-    /// validation.
+    /// The split of the keyframe at index `ix` of a camera: every 8th keyframe, starting at index 0, is for testing,
+    /// and every 8th, starting at index 4, for validation.
     pub fn of(ix: usize) -> Self {
         match ix % 8 {
             0 => Self::Test,
@@ -41,7 +41,8 @@ pub struct Keyframe {
     pub focal_px: [f64; 2],
     /// Principal point of the undistorted image, pixels.
     pub principal_px: [f64; 2],
-    /// `[height, width, 4]`, sRGB; alpha is 255 for valid pixels, 0 where undistortion or a mask left nothing.
+    /// `[height, width, 4]`, sRGB. Alpha is 255 for valid pixels, and 0 for pixels that are masked or left empty by
+    /// undistortion.
     pub rgba_srgb: Arc<[u8]>,
     /// Depth, if the camera provides it.
     pub depth: Option<DepthMap>,
@@ -51,7 +52,8 @@ pub struct Keyframe {
     pub twist: Option<Twist>,
     /// Time from the first row's exposure to the last row's, seconds; 0 for a global shutter.
     pub readout_secs: f64,
-    /// Twist of the camera, in its own axes, per radian or meter of each joint that carries it; empty if unknown.
+    /// For each joint that carries the camera, the twist of the camera, in its own axes, when only that joint moves at
+    /// unit speed. Empty if unknown.
     pub joint_twists: Arc<[Twist]>,
     /// State of the base that carries the camera; `None` if the base is fixed.
     pub base: Option<BaseState>,
@@ -62,7 +64,8 @@ pub struct Keyframe {
 }
 
 impl Keyframe {
-    /// Whether most of the image has no depth: there is none, or it comes from a scanner, which covers only a band.
+    /// Whether most of the image has no depth: the keyframe has no depth, or its depth comes from a range scanner,
+    /// which covers only a band.
     pub fn lacks_dense_depth(&self) -> bool {
         self.depth.as_ref().is_none_or(|depth| {
             let n_known = depth.depth_m.iter().filter(|z| **z > 0.0).count();
@@ -77,7 +80,7 @@ impl Keyframe {
         (self.rgba_srgb.len() + depth + truth) as u64
     }
 
-    /// Fails if the length of an array does not match its size in pixels.
+    /// Checks that the lengths of the arrays match their sizes in pixels.
     pub fn check(&self) -> Result<(), Error> {
         let [width, height] = self.size_px;
         let (got, expected) = (self.rgba_srgb.len(), 4 * width as usize * height as usize);
@@ -93,7 +96,7 @@ impl Keyframe {
         Ok(())
     }
 
-    /// The keyframe after correcting the base pose: all poses are multiplied by `map_from_odom` from the left.
+    /// Returns the keyframe with a corrected base pose: all its poses are multiplied by `map_from_odom` from the left.
     pub fn with_base_correction(&self, map_from_odom: &Transform) -> Self {
         Self {
             world_from_camera: map_from_odom * self.world_from_camera,
@@ -125,11 +128,11 @@ impl Keyframe {
 /// State of a mobile base at the time of a keyframe.
 #[derive(Clone, Debug, PartialEq)]
 pub struct BaseState {
-    /// Station at which the base stood, counted from 0; `None` while it moves.
+    /// Index of the station at which the base is stationary, from 0; `None` while the base moves.
     pub station: Option<usize>,
     /// Pose of the base at the keyframe's stamp, as reported by its source.
     pub world_from_base: Transform,
-    /// Correction by which the poses of the keyframe have been multiplied from the left: the drift of the source.
+    /// Drift correction by which the poses of the keyframe have been multiplied from the left.
     pub map_from_odom: Transform,
     /// The true pose of the base, from a simulator.
     pub truth: Option<Transform>,
@@ -172,8 +175,9 @@ impl DepthMap {
         Vector3::new(ray(x, 0), ray(y, 1), 1.0) * z_m
     }
 
-    /// An image of the center pixels of squares of `stride` by `stride` pixels (`stride` is odd): the same readings
-    /// along the same rays. Incomplete squares at the far edges are dropped.
+    /// Returns a smaller depth map that contains the center pixel of every square of `stride` by `stride` pixels
+    /// (`stride` is odd), with the same readings along the same rays. Incomplete squares at the right and lower edges
+    /// are dropped.
     #[must_use]
     pub fn subsampled(&self, stride: u32) -> Self {
         let [width, height] = self.size_px.map(|size| size / stride);
@@ -193,11 +197,12 @@ impl DepthMap {
 /// The noise-free image and the true pose, from a simulator.
 #[derive(Clone, Debug)]
 pub struct Truth {
-    /// `[height, width, 4]`, sRGB, no noise.
+    /// `[height, width, 4]`, sRGB, without noise.
     pub rgba_srgb: Arc<[u8]>,
     /// True pose at the keyframe's stamp.
     pub world_from_camera: Transform,
-    /// PSNR of the keyframe's image against its noise-free version, dB: no model can score more. `None` without noise.
+    /// PSNR of the keyframe's image against its noise-free version, dB; a perfect model reaches this score. `None`
+    /// without noise.
     pub psnr_ceiling: Option<f64>,
 }
 

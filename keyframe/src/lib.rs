@@ -1,4 +1,4 @@
-//! Posed images for training: what capture produces and trainers take.
+//! Posed images for training, which `capture` produces and trainers consume.
 //!
 //! A [`Keyframe`] is an undistorted image with the pose of its camera at mid-exposure, optionally with a [`DepthMap`],
 //! the motion of a rolling shutter and, from a simulator, the [`Truth`]. [`RangePoints`] is one revolution of a range

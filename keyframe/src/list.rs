@@ -40,13 +40,14 @@ impl KeyframeList {
         self.0.is_empty()
     }
 
-    /// Returns a message if some listed keyframes are not among these cameras and stamps.
+    /// Checks the list against the cameras and stamps of the data. Returns a message if some listed keyframes are
+    /// missing.
     ///
     /// `example_image`: an image of the data, listed or not, for the error message.
     ///
     /// # Errors
     ///
-    /// If none of the listed keyframes is among them.
+    /// If no listed keyframe is in the data.
     pub fn check_found<'a>(
         &self,
         found: impl Iterator<Item = (&'a str, Stamp)>,
@@ -116,7 +117,7 @@ pub fn split_name(split: Split) -> &'static str {
     SPLITS.iter().find(|(known, _)| *known == split).map_or("train", |(_, name)| name)
 }
 
-/// The split of a name in files.
+/// The split with this name in files.
 #[must_use]
 pub fn split_from_name(name: &str) -> Option<Split> {
     SPLITS.iter().find(|(_, known)| *known == name).map(|(split, _)| *split)

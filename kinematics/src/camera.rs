@@ -1,4 +1,4 @@
-//! Camera models: pixel `(0, 0)` covers `[0,1) x [0,1)`; x right, y down, z forward.
+//! Camera models. Pixel `(0, 0)` covers `[0,1) x [0,1)`; camera axes are x right, y down, z forward.
 
 use crate::Error;
 use crate::lens;
@@ -13,7 +13,7 @@ pub struct Intrinsics {
     pub focal_px: [f64; 2],
     /// Principal point, pixels; the center of pixel `(0, 0)` is `(0.5, 0.5)`.
     pub principal_px: [f64; 2],
-    /// Distortion of the lens.
+    /// Lens distortion.
     pub lens: Lens,
     /// Whether the image is already undistorted. If so, the lens coefficients are ignored.
     pub rectified: bool,
@@ -39,9 +39,10 @@ pub struct Intrinsics {
 pub enum Lens {
     /// No distortion.
     Pinhole,
-    /// Radial k1 k2 k3 and tangential p1 p2, in the order of OpenCV: k1, k2, p1, p2, k3.
+    /// Radial (k1, k2, k3) and tangential (p1, p2) coefficients in the order of OpenCV: k1, k2, p1, p2, k3.
     BrownConrady([f64; 5]),
-    /// Fisheye, equidistant polynomial k1 k2 k3 k4 (Kannala and Brandt 2006, as in OpenCV's fisheye model).
+    /// Fisheye: coefficients k1, k2, k3, k4 of the equidistant polynomial (Kannala and Brandt 2006, as in OpenCV's
+    /// fisheye model).
     KannalaBrandt([f64; 4]),
 }
 
@@ -83,7 +84,8 @@ impl Intrinsics {
         Some((self.pixel_at(distorted.value)?, pixel_by_point))
     }
 
-    /// Back-projects a pixel to the point on its ray with `z = 1`. Inverts [`Intrinsics::project`] to 1e-12.
+    /// Back-projects a pixel to the point on its ray with `z = 1`. The inverse of [`Intrinsics::project`], accurate to
+    /// 1e-12.
     ///
     /// Returns `None` if the pixel is not finite or if no direction in front of the camera projects to it.
     pub fn unproject(&self, pixel: [f64; 2]) -> Option<Vector3<f64>> {
@@ -102,7 +104,7 @@ impl Intrinsics {
         Some(Vector3::new(plane.x, plane.y, 1.0))
     }
 
-    /// Scales the image size by `frac`, rounded to whole pixels and at least one, and returns the intrinsics for it.
+    /// Returns the intrinsics for the image scaled by `frac`. Its size is rounded to whole pixels, at least one.
     ///
     /// Focal length and principal point follow the rounded size, so image corners map to image corners.
     #[expect(clippy::cast_possible_truncation, reason = "the cast saturates, as intended")]
@@ -128,13 +130,13 @@ impl Intrinsics {
         Self { lens: Lens::Pinhole, rectified: true, ..*self }
     }
 
-    /// Whether the pinhole model describes the image: it is rectified, has no lens model, or all lens coefficients
-    /// are zero.
+    /// Whether the pinhole model describes the image: the image is rectified, the lens is a pinhole, or all
+    /// coefficients of a Brown-Conrady lens are zero.
     pub fn is_pinhole(&self) -> bool {
         match self.lens_in_use() {
             Lens::Pinhole => true,
             Lens::BrownConrady(k) => k == [0.0; 5],
-            Lens::KannalaBrandt(_) => false, // Even with zero coefficients the projection is equidistant.
+            Lens::KannalaBrandt(_) => false, // The projection is equidistant even if all coefficients are zero.
         }
     }
 
@@ -252,7 +254,9 @@ mod tests {
     #[test]
     fn derivatives_match_central_differences() {
         const NUDGE_M: f64 = 1e-6;
-        const CLOSE: f64 = 1e-6; // Pixels per meter out of hundreds: truncation 1e-12 and rounding 1e-13 / 1e-6 of them.
+        // Derivatives are hundreds of pixels per meter, with relative errors of 1e-12 (truncation) and 1e-13 / 1e-6
+        // (rounding).
+        const CLOSE: f64 = 1e-6;
         for lens in lenses() {
             let camera = camera(lens);
             for point in [[0.3, -0.2, 1.5], [0.0, 0.0, 0.7], [-0.4, 0.35, 1.1], [1e-9, 0.0, 1.0]] {
@@ -289,7 +293,7 @@ mod tests {
 
     #[test]
     fn barrel_distortion_stops_at_its_limit() {
-        // r (1 - 0.3 r2) peaks at r = 1 / sqrt(0.9), where it is 2 / 3 of r.
+        // r (1 - 0.3 r2) has its maximum, 2 / 3 of r, at r = 1 / sqrt(0.9).
         let camera = camera(Lens::BrownConrady([-0.3, 0.0, 0.0, 0.0, 0.0]));
         let turning_radius = 1.0 / 0.9_f64.sqrt();
         let at = |radius: f64| camera.project(&Vector3::new(radius * 0.6, radius * 0.8, 1.0));

@@ -15,11 +15,11 @@ pub struct Chain {
     joint_names: Vec<String>,
     limits: Vec<JointLimits>,
     segments: Vec<Segment>,
-    /// From the last joint's frame (axis along z) to the tip link.
+    /// Pose of the tip link in the frame of the last joint, whose axis is z.
     last_from_tip: RigidMotion,
 }
 
-/// A constant transform followed by one joint along or about the z axis.
+/// A constant transform, followed by the motion of one joint along or about the z axis.
 ///
 /// Fixed joints are merged into the constant, and frames are rotated so that every joint moves along or about z. Both
 /// happen once, when the chain is built.
@@ -91,8 +91,8 @@ impl Chain {
         &self.tip_link
     }
 
-    /// Names of the moving joints, from base to tip. A joint that mimic joints follow is listed where it first
-    /// affects the chain.
+    /// Names of the independent moving joints, from base to tip. A joint that a mimic joint follows is listed at the
+    /// first position where it affects the chain, even if it is not on the path from base to tip.
     pub fn joint_names(&self) -> &[String] {
         &self.joint_names
     }
@@ -102,7 +102,7 @@ impl Chain {
         self.joint_names.len()
     }
 
-    /// Allowed ranges of the moving joints.
+    /// Limits of the moving joints, in the order of [`Chain::joint_names`].
     pub fn limits(&self) -> &[JointLimits] {
         &self.limits
     }
@@ -126,8 +126,8 @@ impl Chain {
         Ok(base_from_tip)
     }
 
-    /// Like [`Chain::forward`], but writes into an existing value. Neither allocates. On error the value is
-    /// unchanged.
+    /// Like [`Chain::forward`], but writes the pose into `base_from_tip`, which is unchanged on error. Neither function
+    /// allocates memory.
     pub fn forward_into(&self, q: &[f64], base_from_tip: &mut Transform) -> Result<(), Error> {
         self.check(q)?;
         let mut pose = RigidMotion::IDENTITY;
@@ -166,8 +166,8 @@ impl Chain {
         Ok(jacobian)
     }
 
-    /// Velocity of the tip relative to the base, in the tip frame, when the joints at `q` move with `qd` (per
-    /// second).
+    /// Velocity of the tip relative to the base, in the tip frame, when the joints are at `q` and move with the
+    /// velocities `qd` (rad/s or m/s).
     pub fn tip_twist(&self, q: &[f64], qd: &[f64]) -> Result<Twist, Error> {
         self.check(qd)?;
         let mut tip = Twist::zero();
@@ -178,8 +178,8 @@ impl Chain {
         Ok(tip)
     }
 
-    /// Velocity of the tip relative to the base, in the tip frame, for each joint at `q` moving alone at 1 per
-    /// second.
+    /// For each joint, the velocity of the tip relative to the base, in the tip frame, when only that joint moves from
+    /// `q` at unit speed (1 rad/s or 1 m/s).
     pub fn tip_twists_by_joint(&self, q: &[f64]) -> Result<Vec<Twist>, Error> {
         let tip_from_base = self.forward(q)?.rotation.inverse();
         let in_tip = |linear: Vector3<f64>, angular: Vector3<f64>| Twist {
@@ -215,7 +215,8 @@ impl Chain {
     }
 }
 
-/// The independent joint, and how `joint` follows it.
+/// How a joint follows an independent joint: `multiplier * source + offset`. A joint without `<mimic>` is its own
+/// source.
 struct MimicRule<'a> {
     source: &'a Joint,
     multiplier: f64,
@@ -229,11 +230,11 @@ fn follow_mimics<'a>(robot: &'a Robot, joint: &'a Joint) -> Result<MimicRule<'a>
         let rejected = |why| Error::Mimic { joint: joint.name.clone(), source_joint: mimic.source.clone(), why };
         let source = robot.joint(&mimic.source).ok_or_else(|| rejected("is not in the URDF"))?;
         if !matches!(source.kind, JointKind::Revolute | JointKind::Prismatic) {
-            return Err(rejected("is not a moving joint of one number"));
+            return Err(rejected("is not a revolute, continuous or prismatic joint"));
         }
         n_mimics += 1;
         if n_mimics > robot.joints().len() {
-            return Err(rejected("follows it in turn"));
+            return Err(rejected("creates a loop of mimic joints"));
         }
         rule.offset += rule.multiplier * mimic.offset;
         rule.multiplier *= mimic.multiplier;
@@ -279,7 +280,7 @@ impl RigidMotion {
             self.translation += rotate(&self.rotation, &Vector3::new(0.0, 0.0, value));
             return;
         }
-        // The product with (cos, 0, 0, sin) of half the angle, skipping the zeros.
+        // Multiplies by the quaternion (cos, 0, 0, sin) of half the angle without the terms that are zero.
         let (sin, cos) = (0.5 * value).sin_cos();
         let r = &self.rotation;
         self.rotation =
@@ -294,7 +295,7 @@ mod tests {
     use std::f64::consts::FRAC_PI_2;
 
     const PANDA: &str = include_str!("../tests/data/panda.urdf");
-    const CLOSE: f64 = 1e-12; // Rounding of a dozen products of numbers near 1.
+    const CLOSE: f64 = 1e-12; // Bounds the rounding error of a dozen products of numbers near 1.
 
     /// Modified Denavit-Hartenberg rows (a, d, alpha) of the Panda.
     const PANDA_DH: [[f64; 3]; 7] = [
@@ -421,7 +422,7 @@ mod tests {
                     let angular = (ahead.rotation * behind.rotation.inverse()).scaled_axis() / (2.0 * NUDGE);
                     assert!((jacobian.fixed_view::<3, 1>(0, joint) - linear).norm() < ABS, "{tip} joint {joint}");
                     assert!((jacobian.fixed_view::<3, 1>(3, joint) - angular).norm() < ABS, "{tip} joint {joint}");
-                    // The same motion as a twist in the tip frame.
+                    // Compares the same motion as a twist in the tip frame.
                     let mut qd = vec![0.0; chain.n_joints()];
                     qd[joint] = 1.0;
                     let twist = chain.tip_twist(&q, &qd).unwrap();
@@ -449,7 +450,7 @@ mod tests {
         let chain = Chain::from_urdf(PANDA, "link0", "link3").unwrap();
         let error_of = |q: &[f64]| chain.forward(q).unwrap_err().to_string();
         assert_eq!(error_of(&[0.0, 1.0]), "2 joint values given, the chain has 3: joint1, joint2, joint3");
-        assert_eq!(error_of(&[0.0, f64::NAN, 0.0]), r#"joint "joint2" is at NaN, not a finite number"#);
+        assert_eq!(error_of(&[0.0, f64::NAN, 0.0]), r#"joint "joint2": NaN is not a finite number"#);
         assert!(chain.jacobian(&[0.0; 4]).is_err() && chain.tip_twist(&[0.0; 3], &[f64::INFINITY; 3]).is_err());
         let names = ["joint3", "x", "joint1", "joint2"].map(String::from);
         assert_eq!(chain.order_in(&names), Ok(vec![2, 3, 0]));
@@ -464,7 +465,7 @@ mod tests {
         let error_of = |urdf: &str, base: &str, tip: &str| Chain::from_urdf(urdf, base, tip).unwrap_err().to_string();
         assert_eq!(
             error_of(ODD, "a", "soft"),
-            r#"joint "float" is floating, only fixed, revolute, continuous and prismatic joints can be computed"#
+            r#"joint "float" has the type floating; only fixed, revolute, continuous and prismatic joints are supported"#
         );
         let mimic = |from: &str, to: &str| error_of(&PANDA.replace(from, to), "link0", "finger_right");
         let source = r#"mimic joint="finger_joint_left""#;
@@ -474,11 +475,11 @@ mod tests {
         );
         assert_eq!(
             mimic(source, r#"mimic joint="hand_tcp""#),
-            r#"joint "finger_joint_right" mimics "hand_tcp", which is not a moving joint of one number"#
+            r#"joint "finger_joint_right" mimics "hand_tcp", which is not a revolute, continuous or prismatic joint"#
         );
         assert_eq!(
             mimic(source, r#"mimic joint="finger_joint_right""#),
-            r#"joint "finger_joint_right" mimics "finger_joint_right", which follows it in turn"#
+            r#"joint "finger_joint_right" mimics "finger_joint_right", which creates a loop of mimic joints"#
         );
     }
 }

@@ -1,4 +1,4 @@
-//! Maps a device's clock to the host clock from message arrival times.
+//! Maps the clock of a device to the host clock, using the arrival times of messages.
 
 use crate::Stamp;
 use std::collections::VecDeque;
@@ -6,14 +6,15 @@ use std::collections::VecDeque;
 /// Maps stamps of one device's clock to the host's monotonic clock.
 ///
 /// Every message arrives at `device * (1 + drift) + offset + latency`, where the latency has a fixed minimum and is
-/// often much larger. All arrivals therefore lie above a line, and the map is the highest such line: the edge of the
-/// lower convex hull across the mean device time (Moon, Skelly and Towsley 1999, section 4). Late arrivals do not
-/// move it. The minimum latency cannot be observed and remains in the result; it is calibrated elsewhere.
+/// often much larger. All arrivals therefore lie above a line. The map is the highest such line: the edge of the lower
+/// convex hull across the mean device time (Moon, Skelly and Towsley 1999, section 4). Late arrivals do not move the
+/// line. The minimum latency cannot be observed and remains in the result; calibration estimates it.
 #[derive(Clone, Debug)]
 pub struct ClockMap {
-    /// First device stamp since the start or the last restart. Device times are relative to it.
+    /// Device stamp and arrival of the first message since the start or the last restart. Device times are relative to
+    /// it.
     origin: Option<Origin>,
-    /// The earliest arrival in each bucket of device time, measured relative to its device time.
+    /// For each bucket of device time, the message with the smallest delay.
     buckets: VecDeque<Bucket>,
     line: Line,
     newest_nanos: i64,
@@ -32,7 +33,7 @@ struct Bucket {
     index: i64,
     /// Seconds of device time since the origin.
     device_secs: f64,
-    /// Arrival minus device time, seconds, relative to the origin's.
+    /// Arrival time minus device time, minus the same difference at the origin, seconds.
     delay_secs: f64,
 }
 
@@ -45,20 +46,20 @@ struct Line {
 
 /// Each bucket keeps one arrival.
 const BUCKET_NANOS: i64 = 250_000_000;
-/// Arrivals older than this are forgotten, so that the map follows a drift that changes with temperature.
+/// Arrivals older than this are discarded, so that the map follows a drift that changes with temperature.
 const WINDOW_SECS: f64 = 120.0;
-/// Exceeds the drift of any common crystal. Steeper slopes are caused by latency.
+/// Maximum drift. It exceeds the drift of any common crystal; steeper slopes are caused by latency.
 const MAX_DRIFT: f64 = 200e-6;
-/// Drift is weighted by the observed time span and applied in full from here on, because latency looks like drift
-/// over short spans.
+/// Observed time span from which on the estimated drift is applied in full. It is applied in proportion to shorter
+/// spans, because latency looks like drift over short spans.
 const FULL_DRIFT_SECS: f64 = 80.0;
-/// A device stamp that is further back than this means that the clock restarted. Smaller steps are reordered
-/// messages.
+/// If a device stamp is earlier than the newest one by more than this, the clock has restarted. Smaller steps back come
+/// from reordered messages.
 const MAX_DISORDER_NANOS: i64 = 500_000_000;
-/// An arrival this far before the line, in seconds, means that the device clock jumped ahead.
+/// If a message arrives earlier than the line by more than this, in seconds, the device clock has jumped ahead.
 const MAX_EARLY_SECS: f64 = 0.25;
-/// If all arrivals in [`MAX_LATE_NANOS`] are this late, in seconds, the device clock jumped back a little or was
-/// paused.
+/// If all arrivals within [`MAX_LATE_NANOS`] are late by more than this, in seconds, the device clock has jumped back a
+/// little or was paused.
 const MAX_LATE_SECS: f64 = 1.0;
 /// How long arrivals must be late before the clock counts as restarted.
 const MAX_LATE_NANOS: i64 = 3_000_000_000;
@@ -97,8 +98,7 @@ impl ClockMap {
         let device_secs = since_nanos as f64 / NANOS_PER_SEC;
         let delay_secs = arrival.nanos_since(origin.arrival).saturating_sub(since_nanos) as f64 / NANOS_PER_SEC;
         let lateness_secs = delay_secs - self.line.at(device_secs);
-        // The very first arrival may have been late by any amount, so early arrivals are checked only after a line
-        // has formed.
+        // The first arrival may have had any latency, so early arrivals are checked only after a line has formed.
         let has_line = self.buckets.len() > 4;
         if has_line && lateness_secs < -MAX_EARLY_SECS {
             return self.restart(device_nanos, arrival);
@@ -130,7 +130,7 @@ impl ClockMap {
         self.map(device_nanos).map_or(arrival, |mapped| mapped.min(arrival))
     }
 
-    /// Relative rate difference: how much faster the host clock runs than the device clock (1e-6 is one part per
+    /// Relative rate difference: positive if the host clock runs faster than the device clock (1e-6 is one part per
     /// million).
     pub fn drift(&self) -> f64 {
         self.line.drift
@@ -189,7 +189,7 @@ impl ClockMap {
         Line { offset_secs: offset_secs.fold(f64::INFINITY, f64::min), drift }
     }
 
-    /// Slope of the edge of the lower hull that spans the mean device time.
+    /// Slope of the edge of the lower convex hull at the mean device time.
     fn hull_slope(&self) -> f64 {
         let mean_secs = self.buckets.iter().map(|bucket| bucket.device_secs).sum::<f64>() / self.buckets.len() as f64;
         let mut hull: Vec<&Bucket> = Vec::with_capacity(self.buckets.len());
@@ -251,7 +251,7 @@ mod tests {
     const JITTER_NANOS: f64 = 75e6;
     const DRIFT: f64 = 50e-6;
 
-    /// A device that sends at a fixed rate over a bad connection. All its numbers derive from one seed.
+    /// A device that sends at a fixed rate over a connection with jitter. Drift and latencies derive from one seed.
     struct Device {
         rate_hz: f64,
         random: Random,
@@ -289,8 +289,9 @@ mod tests {
 
     #[test]
     fn jitter_and_drift_are_filtered_to_a_millisecond() {
-        // Rate, run length, settling time, largest error after settling, and number of runs that may exceed it, up to
-        // twice. With a low rate, fast messages are rare: the fastest of n messages in a window is about 75 ms / n late.
+        // Rate, run length, settling time, maximum error after settling, and number of runs whose error may be up to
+        // twice the maximum. At a low rate, messages with a low latency are rare: the fastest of n messages in a window
+        // has about 75 ms / n of jitter.
         const RUNS: [(f64, f64, f64, i64, usize); 4] = [
             (1000.0, 30.0, 2.0, 300_000, 0),
             (200.0, 60.0, 6.0, 700_000, 0),
@@ -326,7 +327,7 @@ mod tests {
 
     #[test]
     fn device_clock_restart_is_detected() {
-        // Back to zero, far ahead, and back by less than it ran.
+        // The clock jumps back to zero, far ahead, and back by less than its running time.
         for jump_nanos in [-70_000_000_000, 3_600_000_000_000, -4_000_000_000] {
             let mut device = Device::new(200.0, 7);
             let mut clock = ClockMap::new();
@@ -357,7 +358,8 @@ mod tests {
         for ix in 0..500 {
             assert_eq!(send(&mut clock, ix * 10, 0), 0);
         }
-        // The device and its clock were paused for three seconds: every stamp is 3 s behind, none goes backwards.
+        // The device and its clock were paused for three seconds: every later stamp is 3 s behind, and no stamp
+        // decreases.
         for ix in 800..1200 {
             send(&mut clock, ix * 10, 3000);
         }

@@ -1,6 +1,6 @@
-//! Errors for invalid input to this crate.
+//! Errors that this crate returns for invalid input.
 
-/// Reason why an input was rejected.
+/// The reason why an input was rejected.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
@@ -16,17 +16,17 @@ pub enum Error {
     },
     /// The upper left 3x3 block is not a rotation: it is scaled, sheared or mirrored.
     #[error(
-        "transform: not rigid, its axes are off unit length or right angles by {off:.2e} (at most {allowed:.0e}) and its determinant is {determinant:.4}"
+        "transform: not rigid: its axes deviate from unit length or right angles by {off:.2e} (at most {allowed:.0e}), and its determinant is {determinant:.4}"
     )]
     NotRigid {
         /// Largest element of `|RᵀR - 1|`.
         off: f64,
         /// Largest value accepted.
         allowed: f64,
-        /// Determinant of the 3x3.
+        /// Determinant of the 3x3 block.
         determinant: f64,
     },
-    /// The last row of the 4x4 is not `0 0 0 1`.
+    /// The last row of the 4x4 matrix is not `0 0 0 1`.
     #[error("transform: last row is {row:?}, must be [0, 0, 0, 1]")]
     LastRow {
         /// The row found.
@@ -92,10 +92,10 @@ pub enum Error {
         /// Second joint above it.
         second: String,
     },
-    /// Following parents leads back to the same link.
+    /// A link is its own ancestor.
     #[error("urdf: link {link:?} is its own ancestor (the joints form a cycle)")]
     Cycle {
-        /// A link on the cycle.
+        /// A link in the cycle.
         link: String,
     },
     /// The tree has no unique root link.
@@ -124,15 +124,15 @@ pub enum Error {
         /// The links above the tip, nearest first.
         ancestors: Vec<String>,
     },
-    /// A joint on the path has a type that cannot be described by one number.
-    #[error("joint {joint:?} is {kind}, only fixed, revolute, continuous and prismatic joints can be computed")]
+    /// A joint on the path has a type with more than one degree of freedom.
+    #[error("joint {joint:?} has the type {kind}; only fixed, revolute, continuous and prismatic joints are supported")]
     JointType {
         /// The joint.
         joint: String,
         /// Its type.
         kind: &'static str,
     },
-    /// A number of a joint is non-finite or out of range, or its axis is zero.
+    /// A number in a joint's description is non-finite or out of range, or the axis of the joint is zero.
     #[error("joint {joint:?}: {what} is {value:?}, which is invalid")]
     JointNumber {
         /// The joint.
@@ -142,7 +142,8 @@ pub enum Error {
         /// Its value.
         value: [f64; 3],
     },
-    /// A mimic joint follows a joint that does not exist, is fixed, or follows the mimic joint in turn.
+    /// A mimic joint follows a joint that does not exist or is not revolute, continuous or prismatic, or mimic joints
+    /// form a loop.
     #[error("joint {joint:?} mimics {source_joint:?}, which {why}")]
     Mimic {
         /// The mimic joint.
@@ -172,12 +173,12 @@ pub enum Error {
         /// Names of the moving joints in order.
         joints: Vec<String>,
     },
-    /// A joint value or velocity is NaN or infinite.
-    #[error("joint {joint:?} is at {value}, not a finite number")]
+    /// A joint position or velocity is NaN or infinite.
+    #[error("joint {joint:?}: {value} is not a finite number")]
     JointNotFinite {
         /// The joint.
         joint: String,
-        /// Its value.
+        /// Its position or velocity.
         value: f64,
     },
 }

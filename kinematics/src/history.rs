@@ -16,7 +16,7 @@ pub enum HistoryError {
         /// Requested stamp.
         requested: Stamp,
     },
-    /// The stamp is before the oldest reading kept. Retrying does not help.
+    /// The stamp is before the oldest stored reading. Retrying does not help.
     #[error("the requested stamp is {:.3} s before the oldest reading kept", .oldest.secs_since(*.requested))]
     TooOld {
         /// The oldest reading kept.
@@ -34,7 +34,7 @@ pub enum HistoryError {
         /// Longest gap allowed.
         max_gap: Duration,
     },
-    /// A pushed reading was not later than the newest one and was dropped.
+    /// A pushed reading was dropped because it was not later than the newest reading.
     #[error("reading is {:.3} ms older than the newest one, dropped", .newest.secs_since(*.pushed) * 1e3)]
     OutOfOrder {
         /// The newest reading kept.
@@ -42,10 +42,10 @@ pub enum HistoryError {
         /// Stamp of the dropped reading.
         pushed: Stamp,
     },
-    /// A pushed reading contained NaN or infinity and was dropped.
+    /// A pushed reading was dropped because it contained NaN or infinity.
     #[error("reading contains a non-finite value, dropped")]
     NotFinite,
-    /// A pushed reading had a different number of joints than earlier ones and was dropped.
+    /// A pushed reading was dropped because it had a different number of joints than earlier readings.
     #[error("reading has {got} joints, earlier readings had {expected}; dropped")]
     JointCount {
         /// Number of joints in the reading.
@@ -59,7 +59,7 @@ fn behind(newest: Stamp, requested: Stamp) -> String {
     format!(" (the newest is {:.1} ms older)", requested.secs_since(newest) * 1e3)
 }
 
-/// Stamped readings in order. The oldest are dropped at capacity.
+/// Stamped readings in order. If the capacity is exceeded, the oldest reading is dropped.
 #[derive(Clone, Debug)]
 struct Readings<T> {
     max_gap: Duration,
@@ -166,8 +166,8 @@ impl JointHistory {
         Self { readings: Readings::new(max_gap, capacity) }
     }
 
-    /// Adds a reading that is later than all earlier ones. Anything else is dropped, counted and returned as an
-    /// error.
+    /// Adds a reading. A reading that is invalid or not later than all stored readings is dropped and counted, and an
+    /// error is returned.
     pub fn push(&mut self, state: JointState) -> Result<(), HistoryError> {
         let numbers = || state.position.iter().chain(&state.velocity).chain(&state.effort);
         if !numbers().all(|number| number.is_finite()) {
@@ -185,8 +185,8 @@ impl JointHistory {
     /// The joints at a stamp.
     ///
     /// Positions follow the cubic through both neighbors' positions and velocities, or a line if the device does not
-    /// report velocities. Velocities are the derivative of that curve; efforts are interpolated linearly. A stamp
-    /// that coincides with a reading returns that reading; missing velocities are the slope to a neighbor.
+    /// report velocities. Velocities are the derivative of that curve; efforts are interpolated linearly. At the stamp
+    /// of a reading, that reading is returned; if it has no velocities, they are the slope of the line to a neighbor.
     pub fn at(&self, stamp: Stamp) -> Result<JointState, HistoryError> {
         let Bracket { before: (before, a), after: (after, b), frac } = self.readings.around(stamp)?;
         let span_secs = after.secs_since(before);
@@ -234,7 +234,7 @@ impl JointHistory {
     }
 }
 
-/// Position and velocity at `frac` on the cubic with the given end positions and end velocities.
+/// Position and velocity at `frac` (0 to 1) on the cubic with the given end positions and end velocities.
 fn hermite([p0, p1]: [f64; 2], [v0, v1]: [f64; 2], span_secs: f64, frac: f64) -> (f64, f64) {
     let (m0, m1, rise) = (v0 * span_secs, v1 * span_secs, p1 - p0);
     let (second, third) = (3.0 * rise - 2.0 * m0 - m1, m0 + m1 - 2.0 * rise);
@@ -256,7 +256,8 @@ impl PoseHistory {
         Self { readings: Readings::new(max_gap, capacity) }
     }
 
-    /// Adds a pose that is later than all earlier ones. Anything else is dropped, counted and returned as an error.
+    /// Adds a pose. A pose that is not finite or not later than all stored poses is dropped and counted, and an error
+    /// is returned.
     pub fn push(&mut self, stamp: Stamp, pose: Transform) -> Result<(), HistoryError> {
         let finite = transform::to_rows(&pose).iter().all(|number| number.is_finite());
         if !finite {
@@ -275,8 +276,8 @@ impl PoseHistory {
         })
     }
 
-    /// The pose and velocity at a stamp. The velocity is constant between neighboring poses and given in the body
-    /// frame at the stamp. It is zero if the pose has no neighbor within the allowed gap.
+    /// The pose and velocity at a stamp. The velocity is assumed constant between neighboring poses, and is expressed
+    /// in the body frame at the stamp. It is zero if the pose has no neighbor within the allowed gap.
     pub fn with_twist_at(&self, stamp: Stamp) -> Result<(Transform, Twist), HistoryError> {
         let Bracket { before: (before, a), after: (after, b), .. } = self.readings.around(stamp)?;
         let pose = self.at(stamp)?;
@@ -385,7 +386,7 @@ mod tests {
             ask(1.03).unwrap_err().to_string(),
             "readings are missing for 30.0 ms around the requested stamp (at most 20.0 ms)"
         );
-        // Stamps at the edges of a gap and of the history have values.
+        // At the edges of a gap and of the history, there are values.
         for secs in [1.01, 1.015, 1.02, 1.05] {
             assert!(ask(secs).is_ok(), "{secs}");
         }

@@ -7,10 +7,10 @@ use crate::Stamp;
 pub struct JointState {
     /// Time of the reading.
     pub stamp: Stamp,
-    /// Radians or meters.
+    /// Positions, radians or meters.
     pub position: Vec<f64>,
-    /// Radians or meters per second; empty if the device does not report velocities.
+    /// Velocities, radians or meters per second; empty if the device does not report them.
     pub velocity: Vec<f64>,
-    /// Newton meters or newtons; empty if the device does not report efforts.
+    /// Efforts, newton meters or newtons; empty if the device does not report them.
     pub effort: Vec<f64>,
 }

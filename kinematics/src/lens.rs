@@ -14,10 +14,11 @@ impl Distorted {
     }
 }
 
-/// Newton's method stops when the step is below this fraction of the value, just above rounding.
+/// Newton's method stops when the step is below this fraction of the value, just above rounding errors.
 const CONVERGED: f64 = 1e-15;
 
-/// Brown 1966 and Conrady 1919, in OpenCV's form. `None` beyond the radius up to which the radial part is monotonic.
+/// Applies Brown-Conrady distortion (Brown 1966, Conrady 1919) in OpenCV's form. `None` beyond the radius up to which
+/// the radial part is monotonic.
 pub(crate) fn brown_conrady(k: &[f64; 5], plane: Vector2<f64>) -> Option<Distorted> {
     let distorted = brown_conrady_unchecked(k, plane);
     let monotonic = positive_on(&radial_derivative(k), plane.norm_squared()) && distorted.jacobian.determinant() > 0.0;
@@ -78,7 +79,8 @@ pub(crate) fn undistort_brown_conrady(k: &[f64; 5], distorted: Vector2<f64>) -> 
     ((check.value - distorted).norm() <= CLOSE * (1.0 + length)).then_some(plane)
 }
 
-/// Kannala and Brandt 2006, equation 6, radial terms only, as in OpenCV's fisheye model.
+/// Applies Kannala-Brandt distortion (Kannala and Brandt 2006, equation 6, radial terms only), as in OpenCV's fisheye
+/// model.
 pub(crate) fn kannala_brandt(k: &[f64; 4], plane: Vector2<f64>) -> Option<Distorted> {
     let radius = plane.norm();
     let angle = radius.atan();
@@ -89,8 +91,8 @@ pub(crate) fn kannala_brandt(k: &[f64; 4], plane: Vector2<f64>) -> Option<Distor
     let series = 1.0 + angle2 * (k[0] + angle2 * (k[1] + angle2 * (k[2] + angle2 * k[3])));
     let length = angle * series;
     let length_by_radius = evaluate(&angle_derivative(k), angle2) / (1.0 + radius * radius);
-    // length / radius, and its derivative divided by radius. Near the axis both quotients lose all digits, and the
-    // map is the identity up to third order.
+    // Computes length / radius, and its derivative divided by radius. Near the axis both quotients lose all digits, but
+    // the map is the identity up to third order.
     const NEAR_AXIS: f64 = 1e-6;
     let (share, share_by_radius2) = if radius < NEAR_AXIS {
         (1.0 + (k[0] - 1.0 / 3.0) * radius * radius, 2.0 * (k[0] - 1.0 / 3.0))
@@ -119,9 +121,9 @@ pub(crate) fn undistort_kannala_brandt(k: &[f64; 4], distorted: Vector2<f64>) ->
 
 /// The smallest `x` from 0 to `limit` with `x p(x²) = target`, if the derivative is positive from 0 up to it.
 ///
-/// Newton's method inside a bracket that shrinks with every step.
+/// Uses Newton's method inside a bracket that shrinks with every step.
 fn solve_odd_polynomial(p: &[f64; 5], derivative: &[f64; 5], target: f64, limit: f64) -> Option<f64> {
-    const MAX_STEPS: usize = 200; // Bisection alone needs about 60 from any bracket.
+    const MAX_STEPS: usize = 200; // Bisection alone needs about 60 steps.
     let value = |x: f64| x * evaluate(p, x * x) - target;
     // Find a bracket: x from `low`, where the value is below the target, to `high`, where it is above or the
     // derivative has changed sign.
@@ -162,8 +164,8 @@ fn evaluate(p: &[f64; 5], s: f64) -> f64 {
 
 /// Whether a polynomial of degree 4 with `p[0] > 0` is positive from 0 to `end`.
 ///
-/// Its Bernstein coefficients on the interval bound it from below. If they are not conclusive, the interval is halved
-/// (Lane and Riesenfeld 1981). For a lens within its range, the first test is conclusive.
+/// The Bernstein coefficients on the interval bound the polynomial from below. If they are not conclusive, the interval
+/// is halved (Lane and Riesenfeld 1981). For a point well inside the range of the lens, the first test is conclusive.
 fn positive_on(p: &[f64; 5], end: f64) -> bool {
     const MAX_HALVINGS: u32 = 30;
     let mut power = [p[0], p[1] * end, 0.0, 0.0, 0.0];
@@ -210,7 +212,7 @@ mod tests {
         assert!(positive_on(&parabola(1e-3), 5.0));
         assert!(!positive_on(&parabola(-1e-3), 5.0));
         assert!(positive_on(&parabola(-1e-3), 0.9));
-        // (s - 0.5)² (s - 2)² + dip has two.
+        // (s - 0.5)² (s - 2)² + dip has two minima.
         let quartic = |dip: f64| [1.0 + dip, -5.0, 8.25, -5.0, 1.0];
         assert!(positive_on(&quartic(1e-3), 3.0));
         assert!(!positive_on(&quartic(-1e-3), 3.0));

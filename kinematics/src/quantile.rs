@@ -1,8 +1,8 @@
 //! Medians and quantiles of finite numbers.
 //!
-//! Except for [`median`], all results are one of the given values; [`Rank`] says which one.
+//! Except for [`median`], every result is one of the given values; [`Rank`] selects which one.
 
-/// Which value is the quantile if it falls between two of `n` sorted values. Indices start at 0.
+/// Selects the value that is returned if the quantile falls between two of `n` sorted values. Indices start at 0.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Rank {
     /// The smallest value that at least the fraction `frac` of the values do not exceed: index `ceil(frac n) - 1`.
@@ -15,7 +15,7 @@ pub enum Rank {
     Upper,
 }
 
-/// The median; the mean of the two middle values if there is an even number of values. `None` if there are none.
+/// The median. For an even number of values, it is the mean of the two middle values. `None` without values.
 pub fn median(values: &[f64]) -> Option<f64> {
     let mut sorted = values.to_vec();
     sorted.sort_unstable_by(f64::total_cmp);
@@ -50,8 +50,8 @@ pub fn quantile(values: &mut [f64], frac: f64, rank: Rank) -> Option<f64> {
     Some(*values.select_nth_unstable_by(ix, f64::total_cmp).1)
 }
 
-/// The range without the lowest and the highest `floor(outside_frac n)` values, for fractions below one half. `None` if
-/// there are no values. Reorders the values.
+/// The range without the lowest and the highest `floor(outside_frac n)` values, for fractions below one half. `None`
+/// without values. Reorders the values.
 pub fn trimmed_range(values: &mut [f64], outside_frac: f64) -> Option<[f64; 2]> {
     let last_ix = values.len().checked_sub(1)?;
     #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a fraction of a length")]

@@ -13,12 +13,12 @@ const GOLDEN_GAMMA: u64 = 0x9e37_79b9_7f4a_7c15;
 #[derive(Clone, Debug)]
 pub struct Random {
     state: u64,
-    /// The Box-Muller method generates two numbers at once.
+    /// Second number of the last Box-Muller pair, for the next call.
     spare_normal: Option<f64>,
 }
 
 impl Random {
-    /// Starts the sequence of a seed. Any seed is good, and neighboring seeds give unrelated sequences.
+    /// Starts the sequence of a seed. All seeds are suitable, and neighboring seeds give unrelated sequences.
     pub fn new(seed: u64) -> Self {
         Self { state: seed, spare_normal: None }
     }
@@ -53,17 +53,17 @@ impl Random {
         usize::try_from(self.bits() % bound as u64).expect("less than a usize")
     }
 
-    /// Uniform in 0 <= x < 1.
+    /// A uniformly distributed number, 0 <= x < 1.
     pub fn unit(&mut self) -> f64 {
         unit_from_bits(self.bits())
     }
 
-    /// Uniform in `low..high`.
+    /// A uniformly distributed number in `low..high`.
     pub fn uniform(&mut self, low: f64, high: f64) -> f64 {
         low + (high - low) * self.unit()
     }
 
-    /// Normally distributed with mean 0 and standard deviation 1.
+    /// A normally distributed number with mean 0 and standard deviation 1.
     pub fn normal(&mut self) -> f64 {
         if let Some(spare) = self.spare_normal.take() {
             return spare;
@@ -82,7 +82,7 @@ impl Random {
     }
 }
 
-/// The bits at index `n` of the sequence of a seed, without computing those before it.
+/// The bits at index `n` of the sequence of a seed, computed without the preceding ones.
 pub fn nth_bits(seed: u64, n: u64) -> u64 {
     let state = seed.wrapping_add(n.wrapping_add(1).wrapping_mul(GOLDEN_GAMMA));
     let mixed = (state ^ (state >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);

@@ -1,9 +1,9 @@
-//! Points in time on one monotonic clock.
+//! Time stamps on one monotonic clock.
 
 use std::ops::{Add, AddAssign, Sub};
 use std::time::Duration;
 
-/// Nanoseconds on one monotonic clock. For images: mid-exposure, if the device reports it.
+/// A time in nanoseconds on one monotonic clock. Images are stamped at mid-exposure, if the device reports it.
 ///
 /// ```
 /// use kinematics::Stamp;

@@ -3,7 +3,7 @@
 use crate::Error;
 use nalgebra::{Isometry3, Matrix3, Rotation3, Translation3, UnitQuaternion, Vector3};
 
-/// Rigid motion; `a_from_b` maps coordinates in frame b to coordinates in frame a, in meters.
+/// A rigid motion, in meters. `a_from_b` maps coordinates in frame b to coordinates in frame a.
 pub type Transform = Isometry3<f64>;
 
 /// Velocity of a frame relative to the world, expressed in that frame.
@@ -17,16 +17,17 @@ pub struct Twist {
     pub angular_rad_s: Vector3<f64>,
 }
 
-/// Largest element of `|RᵀR - 1|` accepted as rounding in a file. Quaternions with three decimals stay below it; a
-/// scale error of 0.1 % does not.
+/// Largest element of `|RᵀR - 1|` that is accepted as a rounding error in a file. Quaternions with three decimals stay
+/// below it; a scale error of 0.1 % exceeds it.
 pub const RIGID_TOLERANCE: f64 = 1e-3;
 
-/// Below this angle, in radians, [`exp`] and [`log`] use series instead of quotients. Both agree to 1e-16 there.
+/// Below this angle, in radians, [`exp`] and [`log`] use series instead of quotients. At this angle, series and
+/// quotients agree to 1e-16.
 const SMALL_ANGLE_RAD: f64 = 1e-4;
 
 /// Parses a row-major 4x4 matrix.
 ///
-/// Removes rounding from the rotation (nearest rotation in the least-squares sense).
+/// The rotation part is replaced by the nearest rotation in the least-squares sense, which removes rounding errors.
 ///
 /// # Errors
 ///
@@ -50,7 +51,8 @@ pub fn from_rows(rows: &[f64; 16]) -> Result<Transform, Error> {
     Ok(Transform::from_parts(translation, UnitQuaternion::from_rotation_matrix(&nearest_rotation(given))))
 }
 
-/// Polar factor by Newton's iteration (Higham 1986), which converges quadratically from a matrix this close to a rotation.
+/// The orthogonal polar factor, by Newton's iteration (Higham 1986), which converges quadratically for matrices that
+/// are close to a rotation.
 fn nearest_rotation(mut matrix: Matrix3<f64>) -> Rotation3<f64> {
     const STEPS: usize = 4; // Errors go from 1e-3 to 1e-6 and 1e-12, then below rounding; one extra step is cheap.
     for _ in 0..STEPS {
@@ -80,7 +82,8 @@ pub fn interpolate(a: &Transform, b: &Transform, frac: f64) -> Transform {
     Transform::from_parts(translation.into(), a.rotation * UnitQuaternion::from_scaled_axis(rotation_vector * frac))
 }
 
-/// Motion of a frame that keeps `twist` for `secs`: the new `world_from_frame` is the old one times this.
+/// Motion of a frame that moves with a constant `twist` for `secs` seconds: the new `world_from_frame` is the old one
+/// times this motion.
 ///
 /// Source: Murray, Li and Sastry 1994, section 2.3.2 (exponential of se(3)).
 ///
@@ -109,7 +112,8 @@ pub fn exp(twist: &Twist, secs: f64) -> Transform {
     Transform::from_parts(translation.into(), UnitQuaternion::from_scaled_axis(rotation_vector))
 }
 
-/// The constant twist that produces `transform` in `secs`. Inverts [`exp`] for rotations below 180 degrees.
+/// The constant twist that produces `transform` in `secs` seconds. The inverse of [`exp`] for rotations below 180
+/// degrees.
 pub fn log(transform: &Transform, secs: f64) -> Twist {
     let rotation_vector = transform.rotation.scaled_axis();
     let angle = rotation_vector.norm();
@@ -126,19 +130,19 @@ pub fn log(transform: &Transform, secs: f64) -> Twist {
 }
 
 impl Twist {
-    /// A frame at rest.
+    /// The twist of a frame at rest.
     pub fn zero() -> Self {
         Self { linear_m_s: Vector3::zeros(), angular_rad_s: Vector3::zeros() }
     }
 
-    /// Twist of another frame rigidly attached to this one, expressed in the other frame (adjoint transform).
+    /// Twist of another frame that is rigidly attached to this one, expressed in the other frame (adjoint transform).
     pub fn of_attached(&self, this_from_other: &Transform) -> Self {
         let other_from_this = this_from_other.rotation.inverse();
         let linear_m_s = self.linear_m_s + self.angular_rad_s.cross(&this_from_other.translation.vector);
         Self { linear_m_s: other_from_this * linear_m_s, angular_rad_s: other_from_this * self.angular_rad_s }
     }
 
-    /// Apparent velocity in this frame of a point at rest in the world, meters per second.
+    /// Velocity, in this frame, of a point at rest in the world, meters per second.
     pub fn apparent_velocity(&self, point_in_frame: &Vector3<f64>) -> Vector3<f64> {
         -(self.linear_m_s + self.angular_rad_s.cross(point_in_frame))
     }
@@ -211,7 +215,7 @@ mod tests {
         assert!(distance(&interpolate(&a, &b, 0.0), &a) < CLOSE);
         assert!(distance(&interpolate(&a, &b, 1.0), &b) < CLOSE);
         assert!(distance(&interpolate(&a, &b, 0.25), &pose(0.25, [0.0, 0.0, 0.25])) < CLOSE);
-        // 170 degrees to 190 degrees is 20 degrees, and the sign of a quaternion means nothing.
+        // From 170 to 190 degrees it is 20 degrees, and q and -q are the same rotation.
         let c = pose(0.0, [0.0, 0.0, 170.0 / 180.0 * PI]);
         let d = pose(0.0, [0.0, 0.0, 190.0 / 180.0 * PI]);
         let flipped = Transform::from_parts(d.translation, UnitQuaternion::new_unchecked(-d.rotation.into_inner()));

@@ -2,17 +2,17 @@
 
 use crate::{Error, Intrinsics};
 
-/// Position in the distorted image of every pixel of the pinhole image. Computed once per camera.
+/// For every pixel of the pinhole image, its position in the distorted image. Computed once per camera.
 ///
-/// Input and output have the size of the camera. Pixel centers are at `(0.5, 0.5)`. OpenCV places them at whole
-/// numbers, so its principal point differs by half a pixel while the pixels are the same.
+/// Input and output have the size of the camera. Pixel centers are at `(0.5, 0.5)`. OpenCV places them at integers, so
+/// its principal point differs by half a pixel, but the resulting images are the same.
 #[derive(Clone, Debug)]
 pub struct Undistortion {
     size_px: [u32; 2],
     taps: Vec<Tap>,
 }
 
-/// Source of one output pixel: the upper left of four neighbors, and the weights of the right and lower ones.
+/// Source of one output pixel: the upper left of four neighbors, and the weights of the right and the lower neighbors.
 #[derive(Clone, Copy, Debug)]
 struct Tap {
     upper_left: u32,
@@ -21,7 +21,7 @@ struct Tap {
 }
 
 impl Tap {
-    /// The source lies outside the image.
+    /// The tap of a pixel whose source lies outside the image.
     const OUTSIDE: Self = Self { upper_left: u32::MAX, right: 0, lower: 0 };
 }
 
@@ -30,7 +30,7 @@ const ONE: u32 = 1 << SHARE_BITS;
 const SHARE_BITS: u32 = 11;
 
 impl Undistortion {
-    /// Computes the map of one camera. For a rectified or pinhole camera it is the identity.
+    /// Computes the map of one camera, which is the identity for a rectified or pinhole camera.
     pub fn new(intrinsics: &Intrinsics) -> Self {
         let pinhole = intrinsics.undistorted();
         let [width, height] = intrinsics.size_px;
@@ -70,9 +70,9 @@ impl Undistortion {
         Ok(self.resample::<4>(rgba))
     }
 
-    /// Undistorts `[height, width]` of depth along the camera's z axis, which lens distortion does not change. Takes
-    /// the nearest source pixel, because averaging across an edge gives a depth at which there is no surface. Pixels
-    /// whose source lies outside the image are 0.
+    /// Undistorts `[height, width]` depth along the camera's z axis. Lens distortion moves depth values but does not
+    /// change them. Each output pixel takes the nearest source pixel, because averaging across an edge gives a depth at
+    /// which there is no surface. Pixels whose source lies outside the image are 0.
     pub fn apply_depth(&self, depth_m: &[f32]) -> Result<Vec<f32>, Error> {
         self.check_len(depth_m.len(), 1)?;
         let [step_right, step_down] = self.steps();
@@ -129,7 +129,8 @@ fn round_share(sum: u32) -> u8 {
     ((sum + (1 << (2 * SHARE_BITS - 1))) >> (2 * SHARE_BITS)) as u8
 }
 
-/// The tap for a source position inside the image. Positions in the outer half pixel take the color of the border.
+/// The tap for a source position inside the image. Positions within half a pixel of the border take the color of the
+/// border.
 #[expect(
     clippy::cast_possible_truncation,
     clippy::cast_sign_loss,

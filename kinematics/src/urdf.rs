@@ -4,7 +4,7 @@ use crate::{Error, Transform};
 use nalgebra::{Translation3, Unit, UnitQuaternion, Vector3};
 use std::collections::HashMap;
 
-/// Links and joints of one robot. All links of joints exist, no link has two parents, there is no cycle, and all
+/// Links and joints of one robot. The links of every joint exist, no link has two parents, there is no cycle, and all
 /// numbers are finite.
 #[derive(Clone, Debug)]
 pub struct Robot {
@@ -32,20 +32,20 @@ pub struct Joint {
     pub axis: Unit<Vector3<f64>>,
     /// Allowed range.
     pub limits: JointLimits,
-    /// The joint it follows, if it does not move independently.
+    /// The joint that this joint follows; `None` if it moves independently.
     pub mimic: Option<Mimic>,
 }
 
 /// Type of a joint's motion.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum JointKind {
-    /// Does not move.
+    /// No motion.
     Fixed,
-    /// About its axis, radians (revolute or continuous).
+    /// Rotation about the axis, radians (revolute or continuous).
     Revolute,
-    /// Along its axis, meters (prismatic).
+    /// Translation along the axis, meters (prismatic).
     Prismatic,
-    /// A type that one number cannot describe; the URDF's name of it.
+    /// A type with more than one degree of freedom, with its name in the URDF.
     Unsupported(&'static str),
 }
 
@@ -69,7 +69,7 @@ pub struct Mimic {
     pub source: String,
     /// Factor on the source's value.
     pub multiplier: f64,
-    /// Added to the scaled value, radians or meters.
+    /// Offset added to the scaled value, radians or meters.
     pub offset: f64,
 }
 
@@ -147,7 +147,7 @@ impl Robot {
     fn reject_cycles(&self) -> Result<(), Error> {
         for start in &self.links {
             let mut link = start;
-            // Going up more steps than there are links visits some link twice; the last one is on the cycle.
+            // Going up more steps than there are links visits a link twice, so the last link is on the cycle.
             for _ in 0..=self.links.len() {
                 match self.joint_above.get(link) {
                     Some(&above) => link = &self.joints[above].parent,

@@ -3,9 +3,13 @@
 
 use crate::error::Context;
 use crate::{camera_path, run_folder};
+use calibration::CalibratedCamera;
+use keyframe::{Keyframe, split_name};
 use kinematics::Transform;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
+use std::sync::Arc;
+use trainer::Method;
 use viz::KeyframePose;
 
 /// Name of the file in the run folder.
@@ -33,6 +37,27 @@ pub struct PosedCamera {
 #[derive(Serialize, Deserialize)]
 struct File {
     cameras: Vec<PosedCamera>,
+}
+
+/// The cameras of these keyframes with the model's corrections.
+pub(crate) fn of_model(method: &mut dyn Method, keyframes: &[Arc<Keyframe>]) -> Vec<PosedCamera> {
+    let mut cameras = Vec::new();
+    for keyframe in keyframes {
+        let lens = method.calibrated_camera(keyframe).unwrap_or_else(|error| {
+            log::debug!("listing a camera without its learned correction: {error}");
+            CalibratedCamera::of(keyframe)
+        });
+        cameras.push(PosedCamera {
+            camera: keyframe.camera.to_string(),
+            stamp_nanos: keyframe.stamp.0,
+            split: split_name(keyframe.split).to_owned(),
+            size_px: keyframe.size_px,
+            focal_px: lens.focal_px,
+            principal_px: lens.principal_px,
+            world_from_camera: row_major(&lens.world_from_camera),
+        });
+    }
+    cameras
 }
 
 /// Writes the list, one camera per line.

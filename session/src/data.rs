@@ -285,7 +285,7 @@ impl Data {
         overrides: Vec<Override>,
         progress: OnReadProgress<'_>,
     ) -> crate::Result<Self> {
-        let Opened { rig, mut source, damage } = open::recording(path, rig, &overrides)?;
+        let Opened { rig, mut source, damage, .. } = open::recording(path, rig, &overrides)?;
         let mut join = Join::new(&rig)?;
         if let Some(list) = list {
             join = join.taking_only(list);

@@ -1,10 +1,11 @@
 //! The loop of a live run: takes keyframes, trains models, and draws pictures for viewers.
 
+use crate::ledger::{KeyframeTimes, Ledger};
 use crate::recoveries::{self, OpenGpu, Recoveries};
 use crate::render_budget::RenderBudget;
 use crate::session::Session;
 use crate::{scene_hint, time_slices};
-use capture::{Change, Feed, InputResult};
+use capture::{Change, Feed, FeedItem, InputResult};
 use keyframe::{Keyframe, Split};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -52,6 +53,8 @@ pub struct Live {
     scoring_time: Duration,
     notes: Vec<String>,
     recoveries: Recoveries,
+    /// Of the first session.
+    ledger: Ledger,
 }
 
 impl Live {
@@ -72,6 +75,7 @@ impl Live {
             scoring_time: Duration::ZERO,
             notes: options.notes,
             recoveries: Recoveries::new(options.open_gpu),
+            ledger: Ledger::default(),
         }
     }
 
@@ -122,6 +126,11 @@ impl Live {
         self.n_evicted
     }
 
+    /// When each keyframe passed the stages from the camera to the first model.
+    pub fn ledger(&self) -> &Ledger {
+        &self.ledger
+    }
+
     /// The models in training.
     pub fn sessions(&self) -> &[Session] {
         &self.sessions
@@ -161,17 +170,17 @@ impl Live {
             Pace::RealTime => {
                 if !self.is_training() || self.is_idle() {
                     let first = self.wait_for_change();
-                    first.map_or(Ok(()), |change| self.apply(change))?;
+                    first.map_or(Ok(()), |item| self.apply(item))?;
                 }
-                while let Some(change) = self.feed.next(Duration::ZERO) {
-                    self.apply(change)?;
+                while let Some(item) = self.feed.next(Duration::ZERO) {
+                    self.apply(item)?;
                 }
             }
             Pace::Lockstep { steps_per_keyframe } => {
                 while !self.feed.ended() && self.is_keyframe_due() {
-                    let Some(change) = self.wait_for_change() else { break };
-                    let is_new = matches!(change, Change::Accepted(_));
-                    self.apply(change)?;
+                    let Some(item) = self.wait_for_change() else { break };
+                    let is_new = matches!(item.change, Change::Accepted(_));
+                    self.apply(item)?;
                     if is_new && self.is_training() {
                         for (at, session) in self.next_keyframe_at.iter_mut().zip(&self.sessions) {
                             *at = session.progress().step + steps_per_keyframe;
@@ -193,7 +202,7 @@ impl Live {
 
     /// The next keyframe that was added or removed; `None` if a requested picture may be drawn now, or nothing happens
     /// for [`IDLE`].
-    fn wait_for_change(&mut self) -> Option<Change> {
+    fn wait_for_change(&mut self) -> Option<FeedItem> {
         if self.hub.n_clients() == 0 {
             return self.feed.next(IDLE);
         }
@@ -201,8 +210,8 @@ impl Live {
         loop {
             let before = Instant::now();
             let timeout = if self.budget.may_render() { Duration::ZERO } else { POLL_PERIOD };
-            if let Some(change) = self.feed.next(timeout) {
-                return Some(change);
+            if let Some(item) = self.feed.next(timeout) {
+                return Some(item);
             }
             let is_requested = self.budget.may_render() && self.hub.wait_for_request(POLL_PERIOD);
             self.budget.add_training(before.elapsed()); // Training had nothing to do in this time.
@@ -241,11 +250,14 @@ impl Live {
             false => u64::MAX,
         };
         let before = Instant::now();
+        let step_before = self.sessions[0].progress().step;
         let (hub, budget) = (&self.hub, self.budget);
         time_slices::train_next(&mut self.sessions, max_steps, || {
             budget.may_render() && hub.wait_for_request(Duration::ZERO)
         })?;
         self.budget.add_training(before.elapsed());
+        // At most one submit is in flight, the one of this slice.
+        self.ledger.completed(step_before);
         Ok(())
     }
 
@@ -279,7 +291,10 @@ impl Live {
             self.budget.add_training(before.elapsed());
             let before = Instant::now();
             match session.render(&pending.request) {
-                Ok(picture) => pending.deliver(picture),
+                Ok(picture) => {
+                    let n_keyframes = self.ledger.n_in_model(session.progress().step);
+                    pending.of_keyframes(n_keyframes as u64).deliver(picture);
+                }
                 Err(error) => pending.fail(&error.to_string()),
             }
             self.budget.add_render(before.elapsed());
@@ -370,15 +385,21 @@ impl Live {
         }
     }
 
-    fn apply(&mut self, change: Change) -> crate::Result<()> {
+    fn apply(&mut self, FeedItem { change, times }: FeedItem) -> crate::Result<()> {
         match change {
             Change::Accepted(keyframe) => {
+                let pushed_at_step = self.sessions[0].progress().step;
                 // A model that has made all its steps gets no more keyframes, so that it equals a model trained alone.
                 self.keyframes.push(keyframe.clone());
                 let mut pushed = Ok(());
                 for session in self.sessions.iter_mut().filter(|session| !session.has_finished_steps()) {
                     // Every session holds the keyframe, even after a GPU failure, so that a restored model gets it.
                     pushed = pushed.and(session.push(&keyframe));
+                }
+                if let Some(input) = times {
+                    let (camera, stamp) = (keyframe.camera.clone(), keyframe.stamp);
+                    let pushed = Instant::now();
+                    self.ledger.push(KeyframeTimes { camera, stamp, input, pushed, pushed_at_step, trained: None });
                 }
                 pushed
             }

@@ -16,11 +16,7 @@ const RETRY_DELAY: Duration = Duration::from_secs(1);
 
 /// What is saved of these sessions if they fail now: a sentence without a period, or empty if nothing is known.
 pub fn describe_recoverable(sessions: &mut [Session]) -> String {
-    let recoverable = sessions.iter_mut().filter_map(|session| {
-        let has_checkpoint = session.has_checkpoint();
-        Some(session.recovery()?.describe_recoverable(has_checkpoint))
-    });
-    recoverable.collect::<Vec<_>>().join("; ")
+    sessions.iter_mut().filter_map(Session::describe_recoverable).collect::<Vec<_>>().join("; ")
 }
 
 /// Opens the GPU again after a failure.
@@ -44,7 +40,7 @@ impl Recoveries {
     /// Continues all sessions on a reopened device if the GPU caused the error. Otherwise, and if all attempts fail,
     /// returns the error.
     pub fn recover(&mut self, sessions: &mut [Session], error: crate::Error) -> crate::Result<()> {
-        if !error.is_gpu_error() || sessions.iter().any(|session| session.recovery().is_none()) {
+        if !error.is_gpu_error() || !sessions.iter().all(Session::can_restart) {
             return Err(error);
         }
         let began = Instant::now();

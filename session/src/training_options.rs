@@ -97,9 +97,12 @@ pub struct AvailableData {
     pub joints: bool,
     /// Poses come from a SLAM system or a base that uses one, so they drift from image to image.
     pub drifts: bool,
-    /// The keyframes are known before training and have depth.
+    /// Keyframes have depth.
     pub depth: bool,
 }
+
+/// Numbers of keyframes at which a live run registers them: at the first, about four are validation images.
+pub const LIVE_ALIGNMENT_KEYFRAMES: [usize; 4] = [32, 64, 128, 256];
 
 impl TrainingOptions {
     /// The requested scene models; `None` if the flag is not given.
@@ -181,6 +184,15 @@ impl TrainingOptions {
             align: CameraRefinement::Always(set - ParamSet::IMAGE_GAINS),
             with_scene: CameraRefinement::Always(set & (ParamSet::IMAGE_POSES | ParamSet::IMAGE_GAINS)),
         })
+    }
+
+    /// Which calibration parameters a live run estimates. Without the flag, those that registration can estimate; on a
+    /// software adapter none, because training is slow already.
+    pub fn refining_live(&self, available: AvailableData, software: bool) -> Result<RefineSettings, Error> {
+        if !self.refine.is_empty() || software {
+            return self.refining(available, Refine::None);
+        }
+        Ok(RefineSettings { with_scene: CameraRefinement::default(), ..available.auto_settings() })
     }
 
     /// The rig file keys that the flags override.

@@ -2,7 +2,7 @@
 
 use crate::print;
 use anyhow::{Context, bail, ensure};
-use kinematics::urdf::Robot;
+use kinematics::urdf::{JointKind, Robot};
 use kinematics::{Chain, transform};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
@@ -77,14 +77,33 @@ fn poses(robot: &Robot, chain: &Chain, joints: &str) -> anyhow::Result<Vec<[f64;
         let base_from_tip = chain.forward(&q).with_context(|| format!("configuration {at} (from 0)"))?;
         Ok(transform::to_rows(&base_from_tip))
     };
-    joints.configurations.iter().enumerate().map(pose).collect()
+    let poses = joints.configurations.iter().enumerate().map(pose).collect::<anyhow::Result<_>>()?;
+    warn_outside_limits(robot, &joints);
+    Ok(poses)
+}
+
+/// Warns about the first value outside the limits of its joint, because it may be in degrees.
+fn warn_outside_limits(robot: &Robot, joints: &JointsFile) {
+    for (at, values) in joints.configurations.iter().enumerate() {
+        for (name, value) in joints.joint_names.iter().zip(values) {
+            let Some(limits) = robot.joint(name).map(|joint| joint.limits) else { continue };
+            if !(limits.lower..=limits.upper).contains(value) {
+                let (lower, upper) = (limits.lower, limits.upper);
+                log::warn!(
+                    "configuration {at} (from 0): {name} is {value}, outside its limits {lower} to {upper} (radians or meters)"
+                );
+                return;
+            }
+        }
+    }
 }
 
 fn check_names(robot: &Robot, names: &[String]) -> anyhow::Result<()> {
     for (at, name) in names.iter().enumerate() {
         ensure!(!names[..at].contains(name), "joint {name:?} is listed twice in joint_names");
         if robot.joint(name).is_none() {
-            let nearest = robot.joints().iter().max_by(|a, b| {
+            let moving = robot.joints().iter().filter(|joint| joint.kind != JointKind::Fixed);
+            let nearest = moving.max_by(|a, b| {
                 let similarity = |joint: &str| strsim::jaro_winkler(joint, name);
                 similarity(&a.name).total_cmp(&similarity(&b.name))
             });

@@ -1,5 +1,6 @@
 //! `fieldrig run`: opens devices, joins their samples, trains, and serves the page.
 
+use super::number_in_range;
 use crate::checkpoint_args::CheckpointArgs;
 use crate::console::{Console, OutputMode, print_next_commands};
 use crate::exit::{self, BadArgument, Exit, InsufficientData};
@@ -8,8 +9,9 @@ use crate::training_args::TrainingArgs;
 use crate::{print, signals};
 use anyhow::Context;
 use capture::config::{ArmDriver, Override, Rig};
+use capture::doctor;
 use capture::open::{self, Devices, Opened};
-use capture::{Counts, Feed, Input, Join, Rejection, SampleUse, StationReport, Stations, Stop};
+use capture::{Counts, Feed, Input, Join, Rejection, SampleUse, StampClock, StationReport, Stations, Stop};
 use drivers::Source;
 use keyframe::{Keyframe, Split, counted};
 use kinematics::Stamp;
@@ -18,9 +20,10 @@ use session::methods::{self, COUNT};
 use session::next_commands::{DataSource, quoted};
 use session::run_folder::{self, CreatedFolders};
 use session::{
-    AvailableData, Checkpoints, Clock, DecisionLog, EndingSession, Evaluator, Evaluators, FinishedModel, Limits, Live,
-    LiveOptions, ModelViewer, Pace, REALIGN, Recovery, Refine, RunDescription, RunFlags, ServedModel, Session,
-    Settings, StoredKeyframes, Viewers, checkpoints, methods_of, recovery,
+    AvailableData, Checkpoints, Clock, DecisionLog, EndingSession, Evaluator, Evaluators, FinishedModel,
+    LIVE_ALIGNMENT_KEYFRAMES, Limits, Live, LiveOptions, ModelViewer, Pace, REALIGN, Recovery, RefineSettings,
+    RunDescription, RunFlags, ServedModel, Session, Settings, StoredKeyframes, Viewers, checkpoints, methods_of,
+    recovery,
 };
 use std::collections::BTreeMap;
 use std::io::IsTerminal;
@@ -48,6 +51,10 @@ pub(crate) struct Args {
     /// Replay a recording instead of live devices
     #[arg(long, value_name = "RECORDING")]
     from: Option<PathBuf>,
+    /// Play the recording at the speed of its devices, instead of as fast as it is used: keyframes are taken as they
+    /// arrive, and images that come too fast are dropped
+    #[arg(long, requires = "from", conflicts_with = "steps_per_keyframe")]
+    real_time: bool,
     /// Also write everything that the devices send to an MCAP file. Images that devices drop then count as a loss (exit
     /// code 3)
     #[arg(long, value_name = "FILE")]
@@ -57,7 +64,7 @@ pub(crate) struct Args {
     #[arg(long, value_name = "FOLDER", conflicts_with_all = ["from", "method", "seed", "max_bytes", "max_splats", "refine", "count"])]
     resume: Option<PathBuf>,
     /// Stop S seconds after the first image; time before --resume counts [default: run until Ctrl-C]
-    #[arg(long, value_name = "S")]
+    #[arg(long, value_name = "S", allow_negative_numbers = true, value_parser = number_in_range(0.0..=1e9))]
     seconds: Option<f64>,
     /// Stop after N optimizer steps, or when the devices have ended and all data is fused; steps before --resume count.
     /// With --lockstep, a seed then gives one result
@@ -266,15 +273,17 @@ pub(super) fn start(
     let rig = Rig::load(&args.rig_file, &overrides)?;
     let kinds = methods_of(&rig)?;
     args.training.options().check_for(&kinds)?;
-    let available = AvailableData { joints: true, drifts: rig.has_moving_base(), depth: false }; // Depth arrives during the run.
+    let depth = rig.cameras.iter().any(|camera| camera.depth.is_some());
+    let available = AvailableData { joints: true, drifts: rig.has_moving_base(), depth };
     let training = args.training.options();
-    let cameras = training.refining(available, Refine::None)?.with_scene;
     training.check_learned(&kinds, available)?;
+    training.refining_live(available, true)?; // Invalid flags are rejected before the GPU is opened.
     let (common, mut settings) = methods::options(&rig.train, args.steps);
     settings.push((COUNT, serde_json::json!(training.count.unwrap_or(CountPolicy::ToCap))));
-    let common = CommonOptions { cameras, ..common };
     let pace = args.pace(&rig)?;
     let gpu = open_gpu()?;
+    let RefineSettings { align, with_scene: cameras } = training.refining_live(available, gpu.is_software())?;
+    let common = CommonOptions { cameras, align, align_at_keyframes: LIVE_ALIGNMENT_KEYFRAMES.to_vec(), ..common };
     let models: Vec<Resumed> = match previous {
         Some(previous) => vec![trainer::resume(gpu.clone(), &previous.checkpoint, &previous.keyframes)?],
         None => {
@@ -288,12 +297,14 @@ pub(super) fn start(
     };
     let hub = Hub::new();
     let server = Server::start(ServerConfig { listen: args.listen }, hub.clone())?;
+    for finding in doctor::suspicious_values(&rig) {
+        log::warn!("{finding}");
+    }
+    let Opened { rig, source, damage, stamp_clock } = args.open(rig)?;
     args.print_address(&server.url())?;
-
-    let Opened { rig, source, damage } = args.open(rig)?;
     let folders = created.make_each(args.out(), &kinds, Some(&rig))?;
     let held = previous.map_or(&[][..], |previous| &previous.keyframes);
-    let (input, evicted) = args.input(&rig, source, held)?;
+    let (input, evicted) = args.input(&rig, (source, stamp_clock), held)?;
     let feed = Feed::start(input, Box::new(Viewers(hub.clone())), stop.clone())?;
     let notes = notes(&gpu);
     let evaluators = Evaluators {
@@ -605,6 +616,7 @@ impl Args {
 
     fn open(&self, rig: Rig) -> anyhow::Result<Opened> {
         match &self.from {
+            Some(recording) if self.real_time => Ok(open::recording(recording, Some(rig), &[])?.in_real_time()),
             Some(recording) => Ok(open::recording(recording, Some(rig), &[])?),
             None => Ok(open::rig(rig, if self.sim { Devices::Sim } else { Devices::Real })?),
         }
@@ -615,7 +627,7 @@ impl Args {
     fn input(
         &self,
         rig: &Rig,
-        source: Box<dyn Source>,
+        (source, stamp_clock): (Box<dyn Source>, StampClock),
         previous: &[Arc<Keyframe>],
     ) -> anyhow::Result<(Input, Vec<Evicted>)> {
         let (join, evicted) = Join::new(rig)?.resume_from(previous);
@@ -624,7 +636,7 @@ impl Args {
             join,
             stations: Stations::new(rig).map(|stations| stations.resume_from(previous)),
             recorder: self.record.as_deref().map(|file| open::recorder(file, rig)).transpose()?,
-            is_live: self.from.is_none(),
+            stamp_clock,
             camera_intrinsics: rig
                 .cameras
                 .iter()
@@ -637,7 +649,7 @@ impl Args {
     /// Recordings and lockstep simulations wait for the trainer; everything else runs in real time.
     fn pace(&self, rig: &Rig) -> Result<Pace, BadArgument> {
         let simulated = self.sim || rig.arm.driver == ArmDriver::Sim;
-        if self.from.is_some() || (simulated && rig.sim.lockstep) {
+        if (self.from.is_some() && !self.real_time) || (simulated && rig.sim.lockstep) {
             let steps_per_keyframe = self.steps_per_keyframe.unwrap_or(DEFAULT_STEPS_PER_KEYFRAME);
             return Ok(Pace::Lockstep { steps_per_keyframe });
         }

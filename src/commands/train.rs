@@ -54,7 +54,7 @@ pub(crate) struct Args {
     replay_decisions: Option<PathBuf>,
     /// Stop after S seconds of training; loading and scoring do not count, time before --resume does
     /// [default: 120, unless --steps is given]
-    #[arg(long, value_name = "S")]
+    #[arg(long, value_name = "S", allow_negative_numbers = true)]
     seconds: Option<f64>,
     /// Stop after N optimizer steps; steps before --resume count. Without --seconds, no decision depends on timing, so
     /// one seed gives one result
@@ -196,12 +196,12 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
     }
     let mut models = args.models(&gpu, &data, replay.as_ref(), checkpoint.as_ref())?;
     let from_step = checkpoint.is_some().then(|| models[0].method.n_total_steps()).transpose()?;
-    if let (Some(steps), Some(from_step), Some(subject)) = (given_steps, from_step, &subject)
-        && steps < from_step
+    // The limit does not count steps of rejected trials and steps before a restart.
+    let step = models[0].method.progress().step;
+    if let (Some(steps), Some(subject)) = (given_steps, &subject)
+        && steps < step
     {
-        return Err(
-            BadArgument(format!("--steps {steps}: {subject} is at step {from_step}; use at least that many")).into()
-        );
+        return Err(BadArgument(format!("--steps {steps}: {subject} is at step {step}; use at least that many")).into());
     }
     if let Some(replay) = &replay {
         replay.check_start(from_step)?;

@@ -2,11 +2,15 @@
 //! (`drivers::can::emulated`). A virtual bus has no bit timing, so bit rates, error states and bus-off are not tested
 //! here.
 
+use drivers::can::cia402::{Cia402, Units};
+use drivers::can::damiao::Damiao;
 use drivers::can::emulated::EmulatedMotor;
-use drivers::can::{ArmConfig, Bus, BusConfig, BusEvent, CanArm, Family, MotorConfig};
-use drivers::wire::can::cia402::Units;
+use drivers::can::odrive::{self, Odrive};
+use drivers::can::robstride::{self, Robstride};
+use drivers::can::tmotor::{self, TMotor};
+use drivers::can::{ArmConfig, Bus, BusConfig, BusEvent, CanArm, MotorConfig, MotorProtocol};
 use drivers::wire::can::mit::{Command as MitCommand, Limits, Motion};
-use drivers::wire::can::{Frame, Id, canopen, odrive, robstride, tmotor};
+use drivers::wire::can::{Frame, Id, canopen};
 use drivers::{Arm, Error, clock};
 use kinematics::Stamp;
 use kinematics::quantile::{Rank, median, quantile};
@@ -17,6 +21,8 @@ use std::thread::JoinHandle;
 use std::time::Duration;
 
 pub(crate) const DAMIAO_LIMITS: Limits = Limits::of(12.5, 30.0, 10.0);
+/// A motor that answers only commands.
+const AK: TMotor = TMotor { motor: 6, model: tmotor::Model::Ak80x9 };
 const UNITS: Units = Units { counts_per_turn: 65_536.0, rated_torque_nm: 10.0 };
 /// Amplitude (rad) and angular frequency (rad/s) of the joint motion.
 const SWING_RAD: f64 = 0.5;
@@ -75,14 +81,14 @@ pub(crate) struct Bench {
 }
 
 impl Bench {
-    /// `commanded`: ids of AK motors that another master commands.
-    pub(crate) fn new(bus: BusConfig, motors: Vec<MotorConfig>, commanded: Vec<u8>) -> Self {
+    /// `commands`: frames that another master sends in each cycle.
+    pub(crate) fn new(bus: BusConfig, motors: Vec<MotorConfig>, commands: Vec<Frame>) -> Self {
         let [stop, is_swinging] = [false; 2].map(|now| Arc::new(AtomicBool::new(now)));
         let bus = Bus::open(&bus).expect("the bus is up");
         let (stop_flag, swing_flag) = (Arc::clone(&stop), Arc::clone(&is_swinging));
         let thread = std::thread::spawn(move || {
             let mut emulated: Vec<EmulatedMotor> =
-                motors.iter().map(|motor| EmulatedMotor::new(motor.family, DAMIAO_LIMITS)).collect();
+                motors.iter().map(|motor| EmulatedMotor::new(&*motor.protocol, DAMIAO_LIMITS)).collect();
             while !stop_flag.load(Ordering::Relaxed) {
                 // Ends when the bus is taken down.
                 let Ok(arrived) = bus.receive(Duration::from_millis(2)) else { return };
@@ -101,11 +107,8 @@ impl Bench {
                         sent.extend(motor.take(frame).expect("the motion is within range"));
                     }
                     sent.extend(motor.report(now).expect("the motion is within range"));
-                    if let Family::TMotor { motor: number, model } = config.family
-                        && commanded.contains(&number)
-                    {
-                        let command = tmotor::encode_command(number, &MitCommand::default(), &model.limits());
-                        sent.extend(motor.take(&command.expect("zeros")).expect("the motion is within range"));
+                    for command in &commands {
+                        sent.extend(motor.take(command).expect("the motion is within range"));
                     }
                 }
                 for frame in sent {
@@ -128,11 +131,11 @@ impl Drop for Bench {
     }
 }
 
-pub(crate) fn motor(joint: &str, family: Family) -> MotorConfig {
+pub(crate) fn motor(joint: &str, protocol: impl MotorProtocol + 'static) -> MotorConfig {
     MotorConfig {
         joint: joint.to_owned(),
         bus_ix: 0,
-        family,
+        protocol: Arc::new(protocol),
         gear_ratio: 1.0,
         is_reversed: false,
         offset_rad: 0.0,
@@ -141,7 +144,7 @@ pub(crate) fn motor(joint: &str, family: Family) -> MotorConfig {
 }
 
 pub(crate) fn damiao(ix: u16) -> MotorConfig {
-    motor(&format!("damiao{ix}"), Family::Damiao { motor: ix, feedback: 0x10 + ix })
+    motor(&format!("damiao{ix}"), Damiao { motor: ix, feedback: 0x10 + ix })
 }
 
 /// One motor of each family, two of them with gears or reversed.
@@ -150,13 +153,10 @@ pub(crate) fn all_families() -> Vec<MotorConfig> {
     vec![
         damiao(1),
         MotorConfig { is_reversed: true, offset_rad: 0.25, ..damiao(2) },
-        motor("robstride", Family::Robstride { motor: 3, model: robstride::Model::Rs02 }),
-        MotorConfig {
-            gear_ratio: 8.0,
-            ..motor("odrive", Family::Odrive { node: odrive::Node::new(4).expect("a node") })
-        },
-        motor("drive", Family::Cia402 { node: node(5), units: UNITS }),
-        motor("ak", Family::TMotor { motor: 6, model: tmotor::Model::Ak80x9 }),
+        motor("robstride", Robstride { motor: 3, model: robstride::Model::Rs02 }),
+        MotorConfig { gear_ratio: 8.0, ..motor("odrive", Odrive { node: odrive::Node::new(4).expect("a node") }) },
+        motor("drive", Cia402 { node: node(5), units: UNITS }),
+        motor("ak", AK),
     ]
 }
 
@@ -214,7 +214,8 @@ fn ten_thousand_frames_at_1_khz_all_arrive() {
 fn joints_are_read_from_motors_of_all_families() {
     let wire = Wire::new("vcan2", false);
     let motors = all_families();
-    let bench = Bench::new(wire.config(false), motors.clone(), vec![6]);
+    let command = tmotor::codec::encode_command(AK.motor, &MitCommand::default(), &AK.model.limits()).expect("zeros");
+    let bench = Bench::new(wire.config(false), motors.clone(), vec![command]);
     let config = ArmConfig { buses: vec![wire.config(false)], motors: motors.clone(), rate_hz: 200.0 };
     let mut arm = CanArm::open(&config).expect("all motors answer");
     assert_eq!(arm.joint_names(), motors.iter().map(|motor| motor.joint.clone()).collect::<Vec<_>>());

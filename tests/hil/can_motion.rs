@@ -3,11 +3,13 @@
 //! a cable is disconnected.
 
 use crate::can::{DAMIAO_LIMITS, Wire, all_families, damiao, ip, motor};
-use drivers::can::emulated::{self, EmulatedMotor, State};
-use drivers::can::{Bus, BusConfig, BusEvent, Family, Gains, MotorConfig, MovableArmConfig, MovableCanArm};
+use drivers::can::cia402::{Cia402, Units};
+use drivers::can::emulated::{EmulatedMotor, State};
+use drivers::can::odrive::{self, Odrive};
+use drivers::can::robstride::{self, Robstride};
+use drivers::can::{Bus, BusConfig, BusEvent, Gains, MotorConfig, MovableArmConfig, MovableCanArm};
 use drivers::motion::{JointTarget, Motion, MotionConfig, MotionLimits, MovableArm, OnLoss};
-use drivers::wire::can::cia402::Units;
-use drivers::wire::can::{Frame, Id, canopen, odrive, robstride};
+use drivers::wire::can::{Frame, Id, canopen};
 use drivers::{Arm, clock};
 use kinematics::Stamp;
 use kinematics::random::Random;
@@ -66,7 +68,7 @@ impl Motors {
         let bus = Bus::open(&bus).expect("the bus is up");
         let thread = std::thread::spawn(move || {
             let mut emulated: Vec<_> =
-                configs.iter().map(|config| EmulatedMotor::new(config.family, DAMIAO_LIMITS)).collect();
+                configs.iter().map(|config| EmulatedMotor::new(&*config.protocol, DAMIAO_LIMITS)).collect();
             let mut commanded_rad = vec![Vec::new(); emulated.len()];
             if ignore_timeout {
                 emulated.iter_mut().for_each(EmulatedMotor::ignore_timeout);
@@ -91,7 +93,7 @@ impl Motors {
                         let before = motor.target();
                         sent.extend(motor.take(frame).expect("the motion is within range"));
                         // For axes and drives, other frames also reset the watchdog.
-                        let has_own_loop = matches!(config.family, Family::Odrive { .. } | Family::Cia402 { .. });
+                        let has_own_loop = !config.protocol.family().has_gains();
                         let is_watchdog_reset = motor.watchdog_reset_at() == Some(now) && !has_own_loop;
                         let is_new = motor.target() != before || is_watchdog_reset;
                         if let (Some(target), true) = (motor.target(), is_new) {
@@ -174,7 +176,7 @@ fn joint_rad(config: &MotorConfig, motor_rad: f64) -> f64 {
 
 pub(crate) fn movable(bus: BusConfig, motors: &[MotorConfig], on_loss: OnLoss) -> MovableArmConfig {
     let with_gains = |motor: &MotorConfig| {
-        let has_gains = !matches!(motor.family, Family::Odrive { .. } | Family::Cia402 { .. });
+        let has_gains = motor.protocol.family().has_gains();
         MotorConfig { gains: has_gains.then_some(GAINS), ..motor.clone() }
     };
     MovableArmConfig {
@@ -187,23 +189,28 @@ pub(crate) fn movable(bus: BusConfig, motors: &[MotorConfig], on_loss: OnLoss) -
             limits: vec![LIMITS; motors.len()],
             on_loss,
             timeout: TIMEOUT,
-            accept_no_watchdog: motors.iter().any(|motor| matches!(motor.family, Family::TMotor { .. })),
+            accept_no_watchdog: motors.iter().any(is_ak),
         },
-        odrive_endpoints: Some(emulated::endpoints()),
+        odrive_endpoints: Some(odrive::emulated::endpoints()),
     }
+}
+
+/// Whether it is an AK motor, which has no watchdog.
+fn is_ak(motor: &MotorConfig) -> bool {
+    motor.protocol.family().name() == "tmotor"
 }
 
 fn drive(number: u8) -> MotorConfig {
     let node = canopen::Node::new(number).expect("a node");
-    motor(&format!("drive{number}"), Family::Cia402 { node, units: UNITS })
+    motor(&format!("drive{number}"), Cia402 { node, units: UNITS })
 }
 
 /// One motor of each family that has a watchdog.
 fn motors_with_watchdog() -> Vec<MotorConfig> {
     vec![
         damiao(1),
-        motor("robstride", Family::Robstride { motor: 3, model: robstride::Model::Rs02 }),
-        motor("odrive", Family::Odrive { node: odrive::Node::new(4).expect("a node") }),
+        motor("robstride", Robstride { motor: 3, model: robstride::Model::Rs02 }),
+        motor("odrive", Odrive { node: odrive::Node::new(4).expect("a node") }),
         drive(5),
     ]
 }
@@ -297,8 +304,7 @@ fn motors_of_all_families_reach_targets() {
 #[ignore = "needs the virtual kernel"]
 fn motors_without_watchdog_get_fail_safe_resent() {
     let wire = Wire::new("vcan13", false);
-    let configs: Vec<_> =
-        all_families().into_iter().filter(|config| matches!(config.family, Family::TMotor { .. })).collect();
+    let configs: Vec<_> = all_families().into_iter().filter(is_ak).collect();
     // The cable is disconnected while the program shuts down, or while the arm is open. No frames arrive until it is
     // reconnected.
     for is_dropped in [true, false] {
@@ -395,7 +401,7 @@ fn unsafe_configurations_are_not_enabled() {
     assert_rejected(&with(&|config| config.motion.timeout = Duration::from_millis(10)), "at least 4 cycles");
     let too_stiff = Gains { stiffness_nm_rad: 900.0, ..GAINS };
     assert_rejected(&with(&|config| config.arm.motors[0].gains = Some(too_stiff)), "supports at most 500");
-    let older_endpoints = || Some(odrive::Endpoints { firmware: "0.6.8".to_owned(), ..emulated::endpoints() });
+    let older_endpoints = || Some(odrive::Endpoints { firmware: "0.6.8".to_owned(), ..odrive::emulated::endpoints() });
     assert_rejected(&with(&|config| config.odrive_endpoints = older_endpoints()), "for firmware 0.6.8");
     let narrow = MotionLimits { position: [1.0, 2.0], ..LIMITS };
     assert_rejected(&with(&|config| config.motion.limits[0] = narrow), "outside its range");

@@ -165,7 +165,7 @@ fn misconfigured_card_reports_fix_command() {
             "sudo ip link set can0 up type can bitrate 500000 restart-ms 100",
             "its bit rate is 500000, but the rig file requires 1000000",
         ),
-        ("sudo ip link set can0 up type can bitrate 1000000", "it does not restart after it goes off the bus"),
+        ("sudo ip link set can0 up type can bitrate 1000000", "it does not restart after a bus-off"),
         ("sudo ip link set can0 type can bitrate 1000000 restart-ms 100", "it is down"),
     ];
     for (set_up, what) in wrong_setups {
@@ -269,10 +269,7 @@ fn persistent_bus_off_is_reported_as_cause() {
         }
     };
     println!("kvaser: {error}");
-    assert!(
-        error.contains("no frame from the motor for 1s") && error.contains("1 time off the bus, 0 restarts"),
-        "{error}"
-    );
+    assert!(error.contains("no frame from the motor for 1s") && error.contains("1 bus-off, 0 restarts"), "{error}");
 }
 
 #[test]
@@ -290,7 +287,7 @@ fn bus_off_stops_moving_arm_until_recovery() {
         arm.command(&JointTarget { position: vec![direction_of_motion; 2] }).expect("the arm is enabled");
         cards[0].enter_bus_off();
         let reason = wait_until_stopped(&arm);
-        assert!(reason.contains("can0 went off the bus"), "{reason}");
+        assert!(reason.contains("can0 went bus-off"), "{reason}");
         let errors = errors_until(&monitor, |errors| errors.n_restarts > 0);
         assert_eq!((errors.n_bus_off, errors.n_restarts), (1, 1), "{errors:?}");
         motors.wait_until("no motor is enabled", |observed| {
@@ -331,7 +328,7 @@ fn controller_state_changes_are_reported() {
     let link = card.link();
     assert_eq!(link.state, Some(State::BusOff), "{link}");
     let problems = link.problems(&card.config());
-    assert!(problems.iter().any(|complaint| complaint.problem.starts_with("it is off the bus")), "{problems:?}");
+    assert!(problems.iter().any(|complaint| complaint.problem.starts_with("it is bus-off")), "{problems:?}");
     // After the kernel has noticed that nothing is transmitted, which may take a second, it accepts frames and drops
     // them.
     let frame = Frame::classic(Id::standard(0x100).expect("11 bits"), &[]).expect("no bytes");
@@ -355,7 +352,7 @@ fn doctor_reports_bus_off_with_working_fix() {
         assert!(clock::now() < until, "{}", card.link());
     }
     let printed = doctor();
-    assert!(printed.contains("can0: it is off the bus") && printed.contains(&fix_command("can0")), "{printed}");
+    assert!(printed.contains("can0: it is bus-off") && printed.contains(&fix_command("can0")), "{printed}");
     // Clear the injected bits, as a chip does that returns to the bus.
     card.inject(0, 0);
     sh(&fix_command("can0"));

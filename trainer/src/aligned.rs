@@ -1,7 +1,9 @@
 //! A scene model that restarts with aligned cameras.
 //!
-//! Alignment runs in parallel with training. If it keeps corrections, the model restarts with corrected keyframes.
-//! Splats, which support more trials of camera parameters, implement alignment separately.
+//! Alignment is requested when the model is created, runs in parallel with training, and its result is applied a planned
+//! number of steps after it began: if it has corrections, the model forgets everything and trains again on corrected
+//! keyframes, because a model trained on wrong poses would have to be corrected, too. In a live run, alignment is repeated
+//! when there are more keyframes, and the model restarts only if the corrections changed noticeably.
 
 use crate::checkpoint::{Checkpoint, PendingCheckpoint};
 use crate::gpu::{Gpu, PassTiming};
@@ -11,9 +13,10 @@ use crate::{Bounds, Error, Method, Picture, Progress, RenderRequest};
 use calibration::TrialReport;
 use calibration::{Alignment, AlignmentTask, alignment_step};
 use calibration::{CalibratedCamera, CameraCorrection, CameraRefinement};
-use keyframe::Keyframe;
+use keyframe::{Keyframe, Split};
 use kinematics::Stamp;
 use serde::{Deserialize, Serialize};
+use std::collections::{BTreeMap, VecDeque};
 use std::path::Path;
 use std::sync::Arc;
 
@@ -23,8 +26,9 @@ const METADATA_KEY: &str = "alignment";
 
 /// A model that can restart.
 pub trait Restartable: Method {
-    /// Forgets all keyframes and all training; compiled kernels may be kept.
-    fn restart(&mut self) -> Result<(), Error>;
+    /// Forgets all keyframes and all training; compiled kernels may be kept. The keyframes pushed from now on have the
+    /// corrections of `alignment`.
+    fn restart(&mut self, alignment: &Alignment) -> Result<(), Error>;
     /// Correction of a camera that was optimized with the scene, relative to the pushed keyframes; `None` if there is
     /// none.
     fn learned_correction(&mut self, _camera: &str) -> Result<Option<CameraCorrection>, Error> {
@@ -41,10 +45,19 @@ pub struct Aligned<M> {
     model: M,
     choice: CameraRefinement,
     alignment_task: AlignmentTask,
-    /// The uncorrected keyframes, kept until alignment is done.
+    /// The uncorrected keyframes in the order of their arrival, kept until alignment is done.
     original_keyframes: Vec<Arc<Keyframe>>,
-    alignment_step: u64,
-    /// Steps of the model before its restart.
+    /// How many of them had arrived when alignment began; `None` before that.
+    n_begun: Option<usize>,
+    /// Number of steps from the beginning of alignment to the use of its result.
+    alignment_steps: u64,
+    /// Step at which the result of the alignment that has begun is due.
+    due_step: Option<u64>,
+    /// Numbers of keyframes at which alignment begins; if there were none from the start, it begins at the first step.
+    at_keyframes: VecDeque<usize>,
+    /// Whether alignment is repeated with more keyframes.
+    is_live: bool,
+    /// Steps of the model before its last restart.
     n_steps_before_restart: u64,
 }
 
@@ -55,21 +68,33 @@ struct AlignedState {
     choice: CameraRefinement,
     is_aligned: bool,
     alignment: Option<Alignment>,
-    alignment_step: u64,
+    alignment_steps: u64,
+    due_step: Option<u64>,
+    at_keyframes: VecDeque<usize>,
+    is_live: bool,
     n_steps_before_restart: u64,
+    /// Camera and stamp of the keyframes, until alignment is done.
+    keyframes: Vec<(String, i64)>,
+    n_begun: Option<usize>,
+}
+
+fn id_of(keyframe: &Keyframe) -> (&str, i64) {
+    (&keyframe.camera, keyframe.stamp.0)
 }
 
 impl<M: Restartable + 'static> Aligned<M> {
     /// A model whose keyframes are aligned as specified by `choice`; the result is applied early in `n_planned_steps`.
     pub fn new(model: M, choice: CameraRefinement, is_software: bool, n_planned_steps: u64) -> Self {
-        let (alignment_task, alignment_step) =
-            (AlignmentTask::new(&choice), alignment_step(is_software, n_planned_steps));
         Self {
             model,
+            alignment_task: AlignmentTask::new(&choice),
             choice,
-            alignment_task,
             original_keyframes: Vec::new(),
-            alignment_step,
+            n_begun: None,
+            alignment_steps: alignment_step(is_software, n_planned_steps),
+            due_step: None,
+            at_keyframes: VecDeque::new(),
+            is_live: false,
             n_steps_before_restart: 0,
         }
     }
@@ -79,20 +104,18 @@ impl<M: Restartable + 'static> Aligned<M> {
         if common.align == CameraRefinement::default() {
             return Box::new(model);
         }
-        Box::new(Self::new(model, common.align.clone(), gpu.is_software(), common.n_planned_steps))
+        let at_keyframes = VecDeque::from(common.align_at_keyframes.clone());
+        Box::new(Self {
+            is_live: !at_keyframes.is_empty(),
+            at_keyframes,
+            ..Self::new(model, common.align.clone(), gpu.is_software(), common.n_planned_steps)
+        })
     }
 
     /// A saved model, with the alignment stored in its folder.
     pub fn load(model: M, folder: &Path) -> Result<Self, Error> {
-        let alignment_task = AlignmentTask::Done(read_metadata(folder)?.alignment);
-        Ok(Self {
-            model,
-            choice: CameraRefinement::default(),
-            alignment_task,
-            original_keyframes: Vec::new(),
-            alignment_step: 0,
-            n_steps_before_restart: 0,
-        })
+        let alignment_task = AlignmentTask::done(read_metadata(folder)?.alignment);
+        Ok(Self { alignment_task, ..Self::new(model, CameraRefinement::default(), false, 0) })
     }
 
     /// Resumes from a checkpoint. `resume` receives the corrected keyframes and finds those that the model was trained
@@ -108,82 +131,131 @@ impl<M: Restartable + 'static> Aligned<M> {
             return Ok((Box::new(model), untrained));
         };
         let invalid_state = |error: serde_json::Error| Error::CheckpointState { reason: error.to_string() };
-        let AlignedState { choice, is_aligned, alignment, alignment_step, n_steps_before_restart } =
-            serde_json::from_value(state).map_err(invalid_state)?;
-        let alignment_task = if is_aligned { AlignmentTask::Done(alignment) } else { AlignmentTask::new(&choice) };
+        let AlignedState {
+            choice,
+            is_aligned,
+            alignment,
+            alignment_steps,
+            due_step,
+            at_keyframes,
+            is_live,
+            n_steps_before_restart,
+            keyframes: ids,
+            n_begun,
+        } = serde_json::from_value(state).map_err(invalid_state)?;
+        let mut alignment_task = AlignmentTask::done(alignment);
+        if !is_aligned {
+            alignment_task.request_again();
+        }
         let corrected: Vec<_> = keyframes.iter().map(|keyframe| alignment_task.corrected(keyframe)).collect();
         let (model, untrained) = resume(&own_checkpoint, &corrected)?;
+        let originals: BTreeMap<_, _> = keyframes.iter().map(|keyframe| (id_of(keyframe), keyframe)).collect();
+        let original = |id: (&str, i64)| originals.get(&id).map(|keyframe| Arc::clone(keyframe));
+        let original_keyframes = ids.iter().filter_map(|(camera, nanos)| original((camera, *nanos))).collect();
         // These are corrected when they are pushed again.
-        let is_untrained = |keyframe: &Arc<Keyframe>| {
-            untrained.iter().any(|other| (&other.camera, other.stamp) == (&keyframe.camera, keyframe.stamp))
+        let untrained = untrained.iter().filter_map(|keyframe| original(id_of(keyframe))).collect();
+        let aligned = Self {
+            model,
+            choice,
+            alignment_task,
+            original_keyframes,
+            n_begun,
+            alignment_steps,
+            due_step,
+            at_keyframes,
+            is_live,
+            n_steps_before_restart,
         };
-        let (untrained_originals, learned): (Vec<_>, Vec<_>) = keyframes.iter().cloned().partition(is_untrained);
-        let original_keyframes = if is_aligned { Vec::new() } else { learned };
-        Ok((
-            Box::new(Self {
-                model,
-                choice,
-                alignment_task,
-                original_keyframes,
-                alignment_step,
-                n_steps_before_restart,
-            }),
-            untrained_originals,
-        ))
+        Ok((Box::new(aligned), untrained))
     }
 
-    /// Applies the result of alignment; if there are corrections, restarts the model.
-    fn finish_alignment(&mut self) -> Result<(), Error> {
-        let has_corrections = self.alignment_task.finish()?;
-        let original_keyframes = std::mem::take(&mut self.original_keyframes);
-        if !has_corrections {
+    /// Starts alignment, if it is requested and there are enough keyframes.
+    fn begin_alignment(&mut self) {
+        let n_keyframes = self.original_keyframes.len();
+        let has_begun = self.n_begun.is_some();
+        let waits = self.is_live && !has_begun && self.at_keyframes.front().is_none_or(|n| n_keyframes < *n);
+        if !self.alignment_task.is_requested() || waits {
+            return;
+        }
+        let n_begun = *self.n_begun.get_or_insert(n_keyframes);
+        let from = if self.is_live { self.model.progress().step } else { 0 };
+        self.due_step.get_or_insert(from + self.alignment_steps);
+        self.alignment_task.begin(self.original_keyframes[..n_begun].to_vec(), &self.choice);
+    }
+
+    /// Applies the result of alignment when due; if it changes corrections, restarts the model.
+    fn finish_alignment_when_due(&mut self) -> Result<(), Error> {
+        let step = self.model.progress().step;
+        let is_idle = self.model.is_idle() && step > 0;
+        let is_due = self.due_step.is_some_and(|due_step| step >= due_step) || (is_idle && !self.is_waiting());
+        if self.alignment_task.is_done() || !is_due {
             return Ok(());
         }
+        self.begin_alignment(); // A model that was resumed at this step has not started it.
+        let is_changed = self.alignment_task.finish(&self.original_keyframes)?;
+        (self.n_begun, self.due_step) = (None, None);
+        let n_keyframes = self.original_keyframes.len();
+        self.at_keyframes.retain(|n| *n > n_keyframes);
+        let original_keyframes = match self.at_keyframes.is_empty() {
+            true => std::mem::take(&mut self.original_keyframes),
+            false => {
+                self.alignment_task.request_again();
+                self.original_keyframes.clone()
+            }
+        };
+        let Some(alignment) = self.alignment_task.result().filter(|_| is_changed) else { return Ok(()) };
         log::info!("training restarts with corrected cameras");
         self.n_steps_before_restart += self.model.n_total_steps()?;
-        self.model.restart()?;
+        self.model.restart(alignment)?;
         original_keyframes.iter().try_for_each(|keyframe| self.model.push(self.alignment_task.corrected(keyframe)))
+    }
+
+    /// Whether the next alignment waits for more keyframes.
+    fn is_waiting(&self) -> bool {
+        self.is_live && self.n_begun.is_none()
+    }
+
+    /// Steps until the result of alignment is due.
+    fn steps_to_alignment(&self) -> u64 {
+        let step = self.model.progress().step;
+        match self.due_step {
+            Some(due_step) if !self.alignment_task.is_done() => due_step.saturating_sub(step),
+            _ => u64::MAX,
+        }
     }
 }
 
 impl<M: Restartable + 'static> Method for Aligned<M> {
     fn push(&mut self, keyframe: Arc<Keyframe>) -> Result<(), Error> {
-        let corrected = self.alignment_task.corrected(&keyframe);
-        if !self.alignment_task.is_done() {
+        self.model.push(self.alignment_task.corrected(&keyframe))?;
+        let is_used = !self.alignment_task.is_done() && keyframe.split != Split::Test && keyframe.is_finite();
+        // After resuming, validation keyframes are pushed again.
+        if is_used && !self.original_keyframes.iter().any(|known| id_of(known) == id_of(&keyframe)) {
             self.original_keyframes.push(keyframe);
         }
-        self.model.push(corrected)
+        Ok(())
     }
 
     fn remove(&mut self, camera: &str, stamp: Stamp) -> Result<(), Error> {
-        self.original_keyframes.retain(|keyframe| keyframe.camera.as_ref() != camera || keyframe.stamp != stamp);
+        if let Some(ix) = self.original_keyframes.iter().position(|keyframe| id_of(keyframe) == (camera, stamp.0)) {
+            self.original_keyframes.remove(ix);
+            self.n_begun = self.n_begun.map(|n_begun| n_begun - usize::from(ix < n_begun));
+        }
         self.model.remove(camera, stamp)
     }
 
     fn step(&mut self, n: u64) -> Result<u64, Error> {
-        let step = self.model.progress().step;
-        if !self.alignment_task.is_done() && (step >= self.alignment_step || (self.model.is_idle() && step > 0)) {
-            // A model that was resumed at this step has not started the task.
-            if self.alignment_task.is_requested() {
-                self.alignment_task.begin(self.original_keyframes.clone(), &self.choice);
-            }
-            self.finish_alignment()?;
-        }
-        let remaining = if self.alignment_task.is_done() {
-            u64::MAX
-        } else {
-            self.alignment_step.saturating_sub(self.model.progress().step)
-        };
-        let n_steps = self.model.step(n.min(remaining))?;
-        // After the first step, which itself needs much CPU time.
-        if self.alignment_task.is_requested() && n_steps > 0 {
-            self.alignment_task.begin(self.original_keyframes.clone(), &self.choice);
+        self.finish_alignment_when_due()?;
+        let n_steps = self.model.step(n.min(self.steps_to_alignment()))?;
+        if n_steps > 0 {
+            self.begin_alignment(); // After the first step, which itself needs much CPU time.
         }
         Ok(n_steps)
     }
 
     fn is_idle(&self) -> bool {
-        self.model.is_idle() && (self.alignment_task.is_done() || self.model.progress().step == 0)
+        let has_ended = self.alignment_task.is_done() || self.is_waiting();
+        self.model.is_idle() && (has_ended || self.model.progress().step == 0)
     }
 
     fn n_total_steps(&mut self) -> Result<u64, Error> {
@@ -258,8 +330,17 @@ impl<M: Restartable + 'static> Method for Aligned<M> {
             choice: self.choice.clone(),
             is_aligned: self.alignment_task.is_done(),
             alignment: self.alignment_task.result().cloned(),
-            alignment_step: self.alignment_step,
+            alignment_steps: self.alignment_steps,
+            due_step: self.due_step,
+            at_keyframes: self.at_keyframes.clone(),
+            is_live: self.is_live,
             n_steps_before_restart: self.n_steps_before_restart,
+            keyframes: self
+                .original_keyframes
+                .iter()
+                .map(|keyframe| (keyframe.camera.to_string(), keyframe.stamp.0))
+                .collect(),
+            n_begun: self.n_begun,
         };
         let invalid_state = |error: serde_json::Error| Error::CheckpointState { reason: error.to_string() };
         let state = serde_json::to_value(state).map_err(invalid_state)?;
@@ -285,7 +366,6 @@ mod tests {
     use crate::tsdf::TsdfModel;
     use calibration::ParamSet;
     use calibration::scenes::{Miscalibration, capture, remaining, wrong_extrinsics};
-    use keyframe::Split;
 
     /// The step at which the result is applied.
     const ALIGNMENT_STEP: u64 = 6;
@@ -393,6 +473,46 @@ mod tests {
             CalibratedCamera::of(test),
             "there must be no corrections without the file"
         );
+    }
+
+    #[test]
+    fn live_model_restarts_when_more_keyframes_change_the_corrections() {
+        let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+        let miscalibration = Miscalibration { extrinsics: wrong_extrinsics(), ..Miscalibration::none() };
+        let keyframes = capture(&miscalibration);
+        let is_used = |keyframe: &&Arc<Keyframe>| keyframe.split != Split::Test;
+        let n_used = keyframes.iter().filter(is_used).count();
+        let n_first = 2 * n_used / 3;
+        let common = CommonOptions {
+            align: CameraRefinement::Always(ParamSet::EXTRINSICS),
+            align_at_keyframes: vec![n_first, n_used],
+            n_planned_steps: 4 * ALIGNMENT_STEP,
+            ..CommonOptions::default()
+        };
+        let start = || Aligned::if_requested(MeanColor::new(ModelOptions::default()), &common, &gpu);
+        let mut model = start();
+        let (first, rest): (Vec<_>, Vec<_>) =
+            keyframes.iter().filter(is_used).enumerate().partition(|(ix, _)| *ix + 1 < n_first);
+        first.iter().for_each(|(_, keyframe)| model.push((*keyframe).clone()).unwrap());
+        train(&mut *model, ALIGNMENT_STEP + 3);
+        assert!(model.alignment().is_none(), "there are too few keyframes");
+        model.push(rest[0].1.clone()).unwrap();
+        train(&mut *model, ALIGNMENT_STEP + 2);
+        assert!(model.progress().step < ALIGNMENT_STEP, "the model must have restarted");
+        let correction = |model: &dyn Method| model.alignment().unwrap().corrections["wrist"].clone();
+        let remaining_after = |model: &dyn Method| remaining(&correction(model), &miscalibration.extrinsics);
+        let (degrees, mm) = remaining_after(&*model);
+        assert!(degrees < 0.1 && mm < 1.0, "{degrees} degrees, {mm} mm");
+        let step = model.progress().step;
+        rest[1..].iter().for_each(|(_, keyframe)| model.push((*keyframe).clone()).unwrap());
+        let before = correction(&*model);
+        train(&mut *model, ALIGNMENT_STEP + 2);
+        let has_restarted = model.progress().step < step + ALIGNMENT_STEP + 2;
+        assert_eq!(has_restarted, correction(&*model) != before, "it restarts only for other corrections");
+        let (degrees, mm) = remaining_after(&*model);
+        assert!(degrees < 0.05 && mm < 0.5, "{degrees} degrees, {mm} mm");
+        train(&mut *model, 3 * ALIGNMENT_STEP);
+        assert!(model.progress().step > 2 * ALIGNMENT_STEP, "no further alignment");
     }
 
     #[test]

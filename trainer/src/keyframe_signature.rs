@@ -2,6 +2,7 @@
 
 use crate::Error;
 use keyframe::{Keyframe, Split};
+use kinematics::Stamp;
 use serde::{Deserialize, Serialize};
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -43,6 +44,11 @@ impl KeyframeSignature {
         }
     }
 
+    /// Whether this is the keyframe of a camera with a stamp.
+    pub(crate) fn is_of(&self, camera: &str, stamp: Stamp) -> bool {
+        self.camera == camera && self.stamp_nanos == stamp.0
+    }
+
     /// Description of a difference from the recorded keyframe; `None` if they match.
     fn difference(&self, keyframe: &Keyframe) -> Option<String> {
         let other = Self::of(keyframe);
@@ -65,34 +71,28 @@ impl KeyframeSignature {
 /// The matched keyframes in the order of a list, and all others.
 pub(crate) type MatchedAndOthers = (Vec<Arc<Keyframe>>, Vec<Arc<Keyframe>>);
 
-/// Finds the expected keyframes, each after applying `corrected`. Fails if one is missing or differs.
+/// Finds the expected keyframes. Fails if one is missing or differs.
 pub(crate) fn match_keyframes(
     expected: &[KeyframeSignature],
     keyframes: &[Arc<Keyframe>],
-    corrected: impl Fn(&Arc<Keyframe>) -> Arc<Keyframe>,
 ) -> Result<MatchedAndOthers, Error> {
     let by_name: HashMap<_, _> = keyframes
         .iter()
         .filter(|keyframe| keyframe.split != Split::Test)
         .map(|keyframe| ((&*keyframe.camera, keyframe.stamp.0), keyframe))
         .collect();
-    let mut found = Vec::new();
-    let mut matched_keyframes: Vec<&Arc<Keyframe>> = Vec::new();
+    let mut found: Vec<Arc<Keyframe>> = Vec::new();
     for expected in expected {
         let (camera, stamp) = (expected.camera.as_str(), expected.stamp_nanos);
         let keyframe = by_name
             .get(&(camera, stamp))
             .ok_or_else(|| Error::CheckpointData(format!("image {stamp} of camera {camera:?} is missing")))?;
-        let corrected = corrected(keyframe);
-        if let Some(difference) = expected.difference(&corrected) {
+        if let Some(difference) = expected.difference(keyframe) {
             return Err(Error::CheckpointData(difference));
         }
-        matched_keyframes.push(*keyframe);
-        found.push(corrected);
+        found.push(Arc::clone(keyframe));
     }
-    let is_matched = |keyframe: &Arc<Keyframe>| {
-        matched_keyframes.iter().any(|matched_keyframe| Arc::ptr_eq(matched_keyframe, keyframe))
-    };
+    let is_matched = |keyframe: &Arc<Keyframe>| found.iter().any(|matched| Arc::ptr_eq(matched, keyframe));
     let others = keyframes.iter().filter(|keyframe| !is_matched(keyframe)).cloned().collect();
     Ok((found, others))
 }

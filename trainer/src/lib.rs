@@ -36,6 +36,7 @@ pub mod request;
 pub mod sort;
 pub mod spherical_harmonics;
 pub mod splat;
+mod submits;
 #[cfg(test)]
 #[path = "../../tests/common/test_data.rs"]
 mod test_data;

@@ -17,7 +17,7 @@ pub struct Progress {
     pub step: u64,
     /// Splats, voxel blocks or table entries.
     pub primitives: u64,
-    /// GPU memory of the model, bytes.
+    /// GPU memory of the model, bytes; 0 for a model in host memory.
     pub bytes: u64,
     /// GPU time of a step, milliseconds, smoothed.
     pub step_millis: f64,
@@ -37,9 +37,11 @@ pub(crate) fn submit_millis(watched: bool) -> f64 {
 ///
 /// Several models can share one device; each is owned by one thread.
 pub trait Method {
-    /// Adds a keyframe. Test keyframes are evaluated, never trained on.
+    /// Adds a keyframe. Test keyframes are evaluated, never trained on. The method checks what it uses of it
+    /// ([`Keyframe::check`]).
     fn push(&mut self, keyframe: Arc<Keyframe>) -> Result<(), Error>;
-    /// Forgets the keyframe with this camera and stamp, if there is one.
+    /// Forgets the keyframe with this camera and stamp, if there is one. What was learned from it stays, and resuming
+    /// from a later checkpoint must not need it.
     fn remove(&mut self, camera: &str, stamp: Stamp) -> Result<(), Error>;
     /// Queues at most `n` optimizer updates, few enough to occupy the GPU for at most 20 ms ([`Method::set_watched`]: 4
     /// ms), and returns their number. At most one submit runs and one is queued.
@@ -52,15 +54,14 @@ pub trait Method {
     /// Waits for queued updates and returns the total number of updates, including those of rejected trials. Unlike
     /// [`Progress::step`], it never decreases.
     fn n_total_steps(&mut self) -> Result<u64, Error>;
-    /// Initializes the model from the keyframes so far, so that it can be rendered without training, as
-    /// [`Method::render`] does.
+    /// Initializes the model from the keyframes so far, so that it can be rendered without training.
     fn seed(&mut self) -> Result<(), Error>;
     /// Waits until all kernels needed for training are compiled; otherwise [`Method::step`] waits for them.
     fn prepare(&mut self) -> Result<(), Error>;
     /// Sets whether pictures are requested during training. Submits are then shorter, but the trained parameters are
     /// bit-identical.
     fn set_watched(&mut self, watched: bool);
-    /// Renders a picture; works from the first keyframe on.
+    /// Renders a picture. If the model is empty, first initializes it as [`Method::seed`] does.
     fn render(&mut self, request: &RenderRequest) -> Result<Picture, Error>;
     /// PSNR of the requested picture against a keyframe's image of the same size, dB, without reading the picture back.
     /// Bit-identical to [`crate::eval::psnr`] of the picture, which also has 8 bits. `None` if the model cannot compare
@@ -87,7 +88,7 @@ pub trait Method {
     fn progress(&self) -> Progress;
     /// Results of the trials, in their order.
     fn report(&self) -> Vec<TrialReport>;
-    /// Writes the model into a folder.
+    /// Writes the model into an existing folder. The files depend only on the model, not on how many steps are planned.
     fn save(&mut self, folder: &Path) -> Result<(), Error>;
     /// Takes a checkpoint of everything needed to continue training; later training does not change it.
     fn checkpoint(&mut self) -> Result<PendingCheckpoint, Error>;

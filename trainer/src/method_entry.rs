@@ -47,7 +47,8 @@ pub struct MethodEntry {
     /// Creates an untrained model.
     pub start: StartModel,
     /// Restores a model from a checkpoint, whose `state.options` are [`ModelOptions`]. The keyframes must contain all
-    /// that the model was trained on.
+    /// that the model was trained on and that were not removed. Some may lack their pixels, because they are removed
+    /// right afterwards.
     pub resume: ResumeModel,
     /// Loads a saved model from its folder, or from a single file.
     pub load: LoadModel,

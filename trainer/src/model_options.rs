@@ -26,6 +26,9 @@ pub struct CommonOptions {
     pub cameras: CameraRefinement,
     /// Camera parameters that are estimated by registering keyframes with depth, before the model is trained on them.
     pub align: CameraRefinement,
+    /// Numbers of keyframes at which they are estimated, in a run whose keyframes arrive while it trains. If empty, they
+    /// are estimated once, from the keyframes that are known at the first step.
+    pub align_at_keyframes: Vec<usize>,
 }
 
 /// Options of a model. `S` are those of its method, by default as JSON, because the type depends on the method.
@@ -46,6 +49,7 @@ impl Default for CommonOptions {
             n_planned_steps: 7000,
             cameras: CameraRefinement::default(),
             align: CameraRefinement::default(),
+            align_at_keyframes: Vec::new(),
         }
     }
 }

@@ -1,4 +1,4 @@
-//! Limits open connections: file descriptors must remain for everything else, and connections in use must stay open.
+//! Limits the number of open connections, so that enough file descriptors remain and connections in use stay open.
 //!
 //! All peers have loopback addresses, so viewers and idle sockets differ only in their behavior. At a limit, a new
 //! connection replaces the least active one.
@@ -17,7 +17,7 @@ use tokio::net::TcpStream;
 const MAX_CONNECTIONS: usize = 256;
 /// Maximum number of WebSocket clients.
 const MAX_CLIENTS: usize = 32;
-/// Connections use at most this fraction of the files that the process may open.
+/// The process may open this many files per connection: connections use at most a quarter of the limit.
 const DESCRIPTORS_PER_CONNECTION: usize = 4;
 /// A connection whose peer accepts no bytes for this long is closed.
 const WRITE_TIMEOUT: Duration = Duration::from_secs(5);
@@ -85,7 +85,7 @@ pub(crate) struct Connection {
 
 #[derive(Debug)]
 struct ConnectionState {
-    /// Once set, reads and writes fail.
+    /// If set, reads and writes fail.
     is_closed: bool,
     reader: Option<Waker>,
     writer: Option<Waker>,
@@ -94,7 +94,7 @@ struct ConnectionState {
     /// Time at which the last request was complete; `None` before the first.
     requested: Option<Instant>,
     opened: Instant,
-    /// Set once the connection is accepted as a WebSocket client.
+    /// The WebSocket client, if the connection was accepted as one.
     client: Option<Client>,
 }
 
@@ -238,7 +238,7 @@ impl Connection {
         state.client.is_some() && !state.is_closed
     }
 
-    /// Returns `None` for a client in use.
+    /// Eviction order of the client; `None` for a client in use.
     fn dispensability(&self, now: Instant) -> Option<Dispensability> {
         let state = self.state();
         let client = state.client.as_ref()?;

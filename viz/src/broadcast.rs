@@ -1,4 +1,4 @@
-//! Encodes new data once for all clients, outside of their sessions.
+//! Encodes new data once for all clients, outside the client sessions.
 
 use crate::Hub;
 use crate::clock::ServerClock;
@@ -124,7 +124,7 @@ pub(crate) async fn broadcast(hub: Hub, clock: ServerClock, latest_messages: wat
                 }
                 Err(error) => {
                     log::error!("cannot encode a message for clients: {error}");
-                    // The failed message is unknown: everything may be encoded again when it changes.
+                    // It is not known which message failed, so all kinds may be encoded again when they change.
                     is_encoding_keyframes = false;
                     image_encodings.values_mut().for_each(|image_encodings| image_encodings.is_running = false);
                 }

@@ -2,7 +2,7 @@
 
 use std::time::Instant;
 
-/// Milliseconds since the server started.
+/// A clock that counts milliseconds since the server started.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct ServerClock {
     started: Instant,

@@ -1,4 +1,4 @@
-//! Errors of starting the server.
+//! Errors that occur when the server starts.
 
 use std::net::SocketAddr;
 

@@ -86,7 +86,7 @@ impl Hub {
         self.queue().n_clients()
     }
 
-    /// The next picture to render, if a client waits for one.
+    /// The next picture to render, if a client is waiting for one.
     ///
     /// Each call returns one stage of one client; clients are served in turn.
     pub fn next_request(&self) -> Option<PendingRender> {
@@ -96,13 +96,14 @@ impl Hub {
             started: Instant::now(),
             hub: self.clone(),
             job,
+            n_keyframes: None,
             is_released: false,
         })
     }
 
     /// Waits up to `timeout` until a client requests a picture. Returns whether one did.
     ///
-    /// For callers with nothing to train.
+    /// For callers that have nothing to train.
     pub fn wait_for_request(&self, timeout: Duration) -> bool {
         let mut queue = self.queue();
         self.shared.work_arrived.wait_while_for(&mut queue, |queue| !queue.has_work(), timeout);
@@ -154,7 +155,8 @@ impl Hub {
     }
 }
 
-/// A picture that a client waits for. If dropped without an answer, the client receives nothing for this stage.
+/// A picture for which a client is waiting. If it is dropped without an answer, the client receives nothing for this
+/// stage.
 #[derive(Debug)]
 pub struct PendingRender {
     /// What to render, at the size of this stage.
@@ -162,6 +164,7 @@ pub struct PendingRender {
     started: Instant,
     hub: Hub,
     job: RenderJob,
+    n_keyframes: Option<u64>,
     is_released: bool,
 }
 
@@ -169,6 +172,13 @@ impl PendingRender {
     /// Requested model; the first if `None`. The name comes from the client and may not exist.
     pub fn method(&self) -> Option<&str> {
         self.job.view_request.method.as_deref()
+    }
+
+    /// Tells the client that the model contains this many keyframes, counted from the start of the run.
+    #[must_use]
+    pub fn of_keyframes(mut self, n_keyframes: u64) -> Self {
+        self.n_keyframes = Some(n_keyframes);
+        self
     }
 
     /// Sends the rendered picture to the client. Encoding happens on the server's threads.
@@ -204,7 +214,10 @@ impl PendingRender {
             projection: projection_message(&view_request.request.projection),
             near_m: view_request.request.near_m,
             far_m: view_request.request.far_m,
+            waited_millis: (self.started - view_request.received).as_secs_f64() * 1e3,
             render_millis: self.started.elapsed().as_secs_f64() * 1e3,
+            encode_millis: None,
+            keyframes: self.n_keyframes,
             color: None,
             depth: None,
         }

@@ -3,9 +3,9 @@
 use jpeg_encoder::{ChromaSubsamplingMethod, ColorType, Encoder, SamplingFactor};
 use std::num::NonZero;
 
-/// Minimum pixels per thread; for smaller images another thread does not help.
+/// Minimum number of pixels per thread. For smaller images, another thread does not help.
 const MIN_STRIP_PX: usize = 96 * 1024;
-/// Maximum number of threads; more gain little for screen-sized images.
+/// Maximum number of threads. More threads gain little for screen-sized images.
 const MAX_THREADS: usize = 8;
 
 /// Resolution of color relative to brightness.
@@ -82,7 +82,7 @@ pub(crate) fn encode(pixels: &Pixels<'_>, quality: u8, chroma: Chroma) -> Result
 /// Encodes about `n_strips` strips in parallel.
 ///
 /// A strip is a separate image with complete rows of blocks. Its scan starts and ends at a byte boundary and does not
-/// depend on the previous strip, exactly as at a restart marker. Joined by these markers, the scans therefore form
+/// depend on the previous strip, exactly as at a restart marker. Joined with restart markers, the scans therefore form
 /// the scan of the whole image with a restart interval of one strip (ITU-T T.81, sections B.2.4.4 and F.1.1.5).
 fn encode_in_strips(pixels: &Pixels<'_>, quality: u8, chroma: Chroma, n_strips: usize) -> Result<Vec<u8>, JpegError> {
     pixels.check()?;

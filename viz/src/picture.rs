@@ -5,13 +5,14 @@ use crate::jpeg::{Chroma, JpegError, Layout, Pixels, encode, n_threads, shrink};
 use crate::protocol::{BinaryHeader, ColorPart, DepthFormat, DepthPart, LiveHeader, PictureHeader, frame};
 use crate::updates::{LiveImage, LivePixels};
 use crate::view_request::ViewRequest;
+use std::time::Instant;
 use trainer::Picture;
 
-/// JPEG quality of the last stage: no visible blocks on textures.
+/// JPEG quality of the last stage. It gives no visible blocks on textures.
 const QUALITY_LAST: u8 = 92;
 /// JPEG quality of intermediate stages and live images, which are soon replaced.
 const QUALITY_INTERMEDIATE: u8 = 80;
-/// Smaller pictures keep full color resolution: halving it saves little, and the page enlarges them.
+/// Smaller pictures keep full color resolution, because halving it saves little and the page enlarges these pictures.
 const MIN_HALVED_PX: usize = 256 * 256;
 /// Maximum width of live images as sent; the page displays them even smaller.
 const MAX_LIVE_WIDTH_PX: u32 = 640;
@@ -37,6 +38,7 @@ pub(crate) fn pack_picture(
     mut header: PictureHeader,
     picture: &Picture,
 ) -> Result<Vec<u8>, PackError> {
+    let began = Instant::now();
     let (color, depth) = std::thread::scope(|scope| {
         // Color and depth in parallel: color takes most of the time and runs on this thread.
         let depth = view_request.depth.map(|format| scope.spawn(move || pack_depth(format, picture)));
@@ -58,6 +60,7 @@ pub(crate) fn pack_picture(
             bytes: depth_bytes.len(),
         });
     }
+    header.encode_millis = Some(began.elapsed().as_secs_f64() * 1e3);
     Ok(frame(&BinaryHeader::Picture(&header), &[&color, &depth_bytes]))
 }
 
@@ -99,7 +102,7 @@ fn live_message(image: &LiveImage, size_px: [u32; 2], factor: u32, jpeg: &[u8], 
     frame(&BinaryHeader::LiveImage(&LiveHeader::new(image, size_px, factor, clock)), &[jpeg])
 }
 
-/// Depth as encoded on the wire.
+/// Depth as encoded in a message.
 struct PackedDepth {
     size_px: [u32; 2],
     meters_per_count: f64,
@@ -127,8 +130,8 @@ fn f32_depth(picture: &Picture) -> PackedDepth {
     PackedDepth { size_px: picture.size_px, meters_per_count: 1.0, bytes }
 }
 
-/// Halves the size, keeping the nearest of each 2x2 pixels so that thin objects in front stay visible; 0 means no
-/// depth.
+/// Halves the size of a depth map. Each block of 2x2 pixels keeps its nearest depth, so that thin objects in front stay
+/// visible; 0 means no depth.
 ///
 /// The largest depth maps to the largest count, for the finest step that 16 bits allow.
 fn half_depth(picture: &Picture, n_threads: usize) -> PackedDepth {

@@ -1,9 +1,10 @@
-//! Poses on the wire: 16 numbers, row major.
+//! Poses in messages: 16 numbers, row-major.
 
 use kinematics::Transform;
 use nalgebra::{Isometry3, Matrix3, Rotation3, Translation3, UnitQuaternion};
 
-/// Maximum deviation of a rotation matrix from orthonormal. A browser's f32 products stay below 1e-5.
+/// Maximum deviation of a rotation matrix from an orthonormal one. Products computed in f32 by a browser stay below
+/// 1e-5.
 const MAX_SKEW: f64 = 1e-3;
 
 /// The row-major 4x4 matrix of a pose.

@@ -54,7 +54,7 @@ pub(crate) struct RenderMessage {
     pub(crate) id: u64,
     /// Requested model; the first if absent.
     pub(crate) method: Option<String>,
-    /// Row major.
+    /// Row-major pose.
     pub(crate) world_from_camera: [f64; 16],
     /// Full size, at scale 1.
     pub(crate) size_px: [u32; 2],
@@ -66,11 +66,11 @@ pub(crate) struct RenderMessage {
     pub(crate) near_m: Option<f64>,
     /// Far limit along z.
     pub(crate) far_m: Option<f64>,
-    /// Only the scene inside this box is rendered.
+    /// Box outside which the scene is not rendered.
     pub(crate) crop: Option<CropMessage>,
     /// Requested outputs.
     pub(crate) outputs: Option<Vec<Output>>,
-    /// Only with the output `depth`.
+    /// Encoding of depth; used only with the output `depth`.
     pub(crate) depth_format: Option<DepthFormat>,
     /// Background color, 0 to 1.
     pub(crate) background_srgb: Option<[f32; 3]>,
@@ -152,7 +152,7 @@ pub(crate) enum ServerMessage<'a> {
     Error { id: Option<u64>, message: &'a str },
     /// Sent at a fixed rate, so that silence indicates a broken connection.
     Heartbeat { clock_millis: f64 },
-    /// Answers a client's `ping`.
+    /// Reply to a client's `ping`.
     Pong { t: f64, clock_millis: f64 },
     /// Ends the connection.
     Goodbye { reason: &'a str },
@@ -214,7 +214,10 @@ pub(crate) struct PictureHeader {
     pub(crate) projection: ProjectionMessage,
     pub(crate) near_m: f64,
     pub(crate) far_m: f64,
+    pub(crate) waited_millis: f64,
     pub(crate) render_millis: f64,
+    pub(crate) encode_millis: Option<f64>,
+    pub(crate) keyframes: Option<u64>,
     pub(crate) color: Option<ColorPart>,
     pub(crate) depth: Option<DepthPart>,
 }

@@ -7,7 +7,7 @@ use std::sync::Arc;
 use tokio::sync::Notify;
 use trainer::Picture;
 
-/// Maximum number of a client's pictures being rendered or sent. Limits the rendering for slow clients.
+/// Maximum number of pictures per client that are being rendered or sent. It limits rendering for slow clients.
 const MAX_UNSENT: usize = 2;
 
 /// If the full picture is expected to take less time than this, coarser stages are skipped.
@@ -54,7 +54,7 @@ pub(crate) struct RenderJob {
 /// A result to send to a client.
 #[derive(Debug)]
 pub(crate) enum Outgoing {
-    /// A rendered stage, not encoded yet. The header lacks the payload's parts.
+    /// A rendered stage that is not encoded yet. The header does not yet describe the parts of the payload.
     Picture(Box<(RenderJob, PictureHeader, Picture)>),
     /// A stage that could not be rendered.
     Failed { id: u64, reason: String },

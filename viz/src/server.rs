@@ -26,7 +26,8 @@ use tokio::sync::watch;
 
 /// Maximum time that a stopping server waits until its clients have received the goodbye.
 const GOODBYE_TIMEOUT: Duration = Duration::from_millis(500);
-/// A connection is closed if a request's headers, or the next request, take longer than this.
+/// A connection is closed if the headers of a request take longer than this, or the next request arrives later than
+/// this.
 const HEADER_TIMEOUT: Duration = Duration::from_secs(3);
 /// Maximum size of a request including its headers, bytes.
 const MAX_REQUEST_BYTES: usize = 32 * 1024;
@@ -34,8 +35,8 @@ const MAX_REQUEST_BYTES: usize = 32 * 1024;
 const SWEEP_PERIOD: Duration = Duration::from_millis(250);
 /// Pause after a failed accept.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(50);
-/// Size of the kernel's send buffer for slow clients, bytes; Linux doubles it. More data would only become stale
-/// there.
+/// Size of the kernel's send buffer per connection, bytes; Linux doubles it. For slow clients, data in a larger buffer
+/// would only become outdated.
 #[cfg(unix)]
 const SEND_BUFFER_BYTES: usize = 64 * 1024;
 /// Maximum number of connections waiting to be accepted.
@@ -45,7 +46,7 @@ const BACKLOG: i32 = 1024;
 const CONTENT_SECURITY_POLICY: &str = "default-src 'self'; img-src 'self' data: blob:; object-src 'none'; base-uri 'none'; \
      form-action 'none'; frame-ancestors 'none'";
 
-/// Address to listen on.
+/// Configuration of the server.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ServerConfig {
     /// A loopback address; port 0 selects a free port.

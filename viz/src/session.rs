@@ -23,7 +23,7 @@ use tokio::time::MissedTickBehavior;
 const HEARTBEAT_PERIOD: Duration = Duration::from_millis(250);
 /// Period of WebSocket pings. The next one is sent only if the last one was answered.
 const PING_PERIOD: Duration = Duration::from_secs(1);
-/// Maximum number of unread replies. A client that causes more is disconnected.
+/// Maximum number of unread replies. A client with more unread replies is disconnected.
 const MAX_REPLIES: usize = 64;
 /// Pictures take precedence over live images and keyframe lists, but delay them by at most this time.
 const MAX_UPDATE_DELAY: Duration = Duration::from_millis(500);
@@ -58,7 +58,7 @@ pub(crate) async fn serve(socket: WebSocket, connection: Arc<Connection>, server
     log::info!("client {client} disconnected");
 }
 
-/// Removes a client from the hub however its session ends.
+/// Removes a client from the hub when its session ends, for whatever reason.
 struct ClientGuard<'a> {
     hub: &'a Hub,
     client: u64,
@@ -135,7 +135,7 @@ impl Reader<'_> {
     }
 }
 
-/// Whether the session continues.
+/// Control flow of a session: continue or end.
 type SessionFlow = ControlFlow<()>;
 
 struct Writer<'a> {
@@ -284,7 +284,7 @@ fn pack(rendered: Box<(crate::queue::RenderJob, crate::protocol::PictureHeader, 
     EncodingTask { id, task }
 }
 
-/// Waits for the picture being encoded; forever if there is none.
+/// Waits until the current picture is encoded. Without one, waits forever.
 async fn finished(encoding: &mut Option<EncodingTask>) -> EncodingResult {
     match encoding {
         Some(encoding) => (&mut encoding.task).await,

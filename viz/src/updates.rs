@@ -1,4 +1,4 @@
-//! Data that the training side publishes to viewers: plain values, of which only the latest counts.
+//! Data that the training thread publishes to viewers. Viewers receive only the latest values.
 
 use kinematics::{Stamp, Transform};
 use serde::Serialize;
@@ -64,7 +64,8 @@ pub struct ModelStatus {
 }
 
 impl Status {
-    /// The same status with curves short enough to send several times per second. Keeps the first and last points.
+    /// Returns the same status with curves that are short enough to send several times per second. The first and last
+    /// points are kept.
     pub(crate) fn thinned(mut self) -> Self {
         for model in std::iter::once(&mut self.model).chain(&mut self.others) {
             let n = model.psnr_history.len();
@@ -122,7 +123,7 @@ pub struct LiveImage {
     pub camera: Arc<str>,
     /// Mid-exposure.
     pub stamp: Stamp,
-    /// The same moment on this process's clock, from which the image's age is computed.
+    /// Mid-exposure on this process's clock, from which the age of the image is computed.
     ///
     /// Recordings and simulations stamp with other clocks. For them, pass the time at which the image was read.
     pub captured_at: Instant,

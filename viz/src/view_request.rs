@@ -3,6 +3,7 @@
 use crate::pose::from_row_major;
 use crate::protocol::{CropMessage, DepthFormat, Output, ProjectionMessage, RenderMessage};
 use kinematics::Transform;
+use std::time::Instant;
 use trainer::{Aabb, Projection, RenderRequest};
 
 /// Maximum width and height that a client may request, pixels.
@@ -16,7 +17,7 @@ const DEFAULT_NEAR_M: f64 = 0.01;
 /// Default far limit, meters.
 const DEFAULT_FAR_M: f64 = 100.0;
 
-/// Reason why a message is invalid; sent to the client.
+/// The reason why a message is invalid, which is sent to the client.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum InvalidRequest {
     #[error("cannot parse the message: {0}")]
@@ -48,6 +49,8 @@ pub(crate) enum InvalidRequest {
 pub(crate) struct ViewRequest {
     /// Number chosen by the client.
     pub(crate) id: u64,
+    /// When it was received.
+    pub(crate) received: Instant,
     /// Requested model; the first if `None`.
     pub(crate) method: Option<String>,
     /// The request at full size.
@@ -72,6 +75,7 @@ impl ViewRequest {
             checked_range(message.near_m.unwrap_or(DEFAULT_NEAR_M), message.far_m.unwrap_or(DEFAULT_FAR_M))?;
         Ok(Self {
             id: message.id,
+            received: Instant::now(),
             method: message.method.clone(),
             request: RenderRequest {
                 world_from_camera: rigid(&message.world_from_camera, "world_from_camera")?,

@@ -1,4 +1,4 @@
-//! The current corrections, and how an optimizer step changes them.
+//! The current corrections, and the application of optimizer steps to them.
 
 use super::layout::{CalibrationParam, Layout};
 use super::prepared_image::PreparedImage;
@@ -19,7 +19,7 @@ impl Corrections {
         Self { by_camera: vec![CameraCorrection::default(); n_cameras] }
     }
 
-    /// Corrected cameras of the images, all of which have depth.
+    /// Corrected views of the images. All images have depth.
     pub(super) fn views(&self, images: &[PreparedImage], layout: &Layout) -> Vec<CorrectedView> {
         let view = |image: &PreparedImage| {
             CorrectedView::new(image, &self.by_camera[image.camera], layout).expect("prepared images have depth")
@@ -27,7 +27,7 @@ impl Corrections {
         images.par_iter().map(view).collect()
     }
 
-    /// Value of a parameter. Extrinsics are given as a motion of the camera, which is exact for small motions.
+    /// Current value of a parameter. Extrinsics are expressed as a motion of the camera, which is exact to first order.
     pub(super) fn value(&self, param: CalibrationParam) -> f64 {
         match param {
             CalibrationParam::Extrinsics(camera, part) if part < 3 => -self.by_camera[camera].translation_m[part],
@@ -83,13 +83,13 @@ impl Corrections {
     }
 }
 
-/// Six consecutive numbers of a step as a motion: meters, then radians.
+/// Interprets six consecutive numbers of a step as a motion: meters, then radians.
 pub(super) fn twist(step: &DVector<f64>, begin: usize) -> Twist {
     let part = |from: usize| Vector3::from_fn(|row, _| step[begin + from + row]);
     Twist { linear_m_s: part(0), angular_rad_s: part(3) }
 }
 
-/// Rotation vector and translation.
+/// Splits a motion into its rotation vector and translation.
 pub(super) fn rotation_and_translation(motion: &Transform) -> ([f64; 3], [f64; 3]) {
     (motion.rotation.scaled_axis().into(), motion.translation.vector.into())
 }

@@ -10,9 +10,10 @@ use nalgebra::DVector;
 
 /// Maximum number of steps at each level, the finest first.
 const MAX_ITERATIONS: [usize; 4] = [12, 4, 4, 4];
-/// Relative depth error above which a point counts as occluded, the finest level first; errors are large at first.
+/// Relative depth error above which a point counts as occluded, the finest level first. It is larger at coarse levels,
+/// where poses still have larger errors.
 pub(super) const OCCLUSION_FRAC: [f64; 4] = [0.04, 0.05, 0.07, 0.1];
-/// A step smaller than this number of standard deviations ends a level.
+/// A step smaller than this number of standard deviations ends a level, the finest first.
 const CONVERGED_STEP_SIGMAS: [f64; 4] = [0.2, 2.0, 2.0, 2.0];
 pub(super) const INITIAL_NOISE: Noise = Noise { photo: 20.0, depth: 0.005 };
 

@@ -3,8 +3,8 @@
 use super::prepared_image::PreparedImage;
 use crate::ParamSet;
 
-/// Typical magnitudes of calibration errors. The solver damps with these scales, and they determine whether a
-/// direction counts as observable.
+/// Typical magnitudes of calibration errors. They set the damping of the solver and determine which directions count as
+/// observable.
 mod prior {
     pub(super) const ROTATION_RAD: f64 = 0.0175; // 1 degree.
     pub(super) const TRANSLATION_M: f64 = 0.005;
@@ -15,12 +15,12 @@ mod prior {
     pub(super) const READOUT_SECS: f64 = 0.01;
 }
 
-/// One parameter to estimate. The first number is the index of the camera, or of the joint.
+/// One parameter to estimate. The first number is the index of the camera or joint.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum CalibrationParam {
     /// Motion of a camera relative to its parent, in its own axes: parts 0 to 2 in meters, 3 to 5 in radians.
     Extrinsics(usize, usize),
-    /// Seconds.
+    /// Time offset of a camera, seconds.
     TimeOffset(usize),
     /// Offset of a joint that carries cameras: radians or meters.
     Joint(usize),
@@ -31,7 +31,7 @@ pub(super) enum CalibrationParam {
     Lens(usize, usize),
     /// Logarithm of the factor on depth.
     DepthScale(usize),
-    /// Seconds.
+    /// Change of the readout time of a camera, seconds.
     Readout(usize),
 }
 
@@ -58,7 +58,7 @@ pub(super) struct Layout {
     joints: Option<usize>,
 }
 
-/// Indices of the first parameters of a camera.
+/// For each kind of parameter of a camera, the index of the first one.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(super) struct CameraParamOffsets {
     pub(super) extrinsics: Option<usize>,
@@ -70,8 +70,8 @@ pub(super) struct CameraParamOffsets {
 }
 
 impl Layout {
-    /// The parameters of a set that apply to the images: a static camera has no time offset, one without joints no
-    /// joint offsets.
+    /// The parameters of a set that apply to the images. A static camera has no time offset, and a camera without
+    /// joints has no joint offsets.
     pub(super) fn new(set: ParamSet, images: &[PreparedImage], n_cameras: usize) -> Self {
         let mut layout = Self::default();
         for camera in 0..n_cameras {

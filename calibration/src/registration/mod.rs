@@ -40,13 +40,12 @@ use std::collections::BTreeSet;
 use std::sync::Arc;
 use sums::PixelSubset;
 
-/// Maximum number of images for estimating the shared parameters; the next constant is the number of partners of each
-/// image.
+/// Maximum number of images for estimating the shared parameters. The next constant is the maximum number of partners
+/// of each image.
 const MAX_IMAGES: usize = 100;
 const PARTNERS_PER_IMAGE: usize = 4;
-/// Maximum number of validation images; the next constant is the minimum for a decision.
+/// Maximum number of validation images.
 const MAX_VALIDATION_IMAGES: usize = 32;
-const MIN_VALIDATION_IMAGES: usize = 4;
 const MIN_PAIRS: usize = 4;
 /// Corrections smaller than this number of standard deviations are not significant.
 const MIN_SIGNIFICANT_SIGMAS: f64 = 3.0;
@@ -55,11 +54,11 @@ const MIN_SIGNIFICANT_SIGMAS: f64 = 3.0;
 struct AlignmentScene {
     images: Vec<PreparedImage>,
     cameras: Vec<Arc<str>>,
-    /// Pairs for the shared parameters.
+    /// Pairs that determine the shared parameters.
     pairs: Vec<Pair>,
-    /// Pairs of all training images, for image poses.
+    /// Pairs of all training images, which determine image poses.
     all_pairs: Vec<Pair>,
-    /// Pairs from training images to validation images.
+    /// Pairs that predict validation images from training images.
     validation_pairs: Vec<Pair>,
 }
 
@@ -104,10 +103,8 @@ pub fn align(keyframes: &[Arc<Keyframe>], choice: &CameraRefinement) -> Option<A
 }
 
 fn includes_image_poses(choice: &CameraRefinement) -> bool {
-    match choice {
-        CameraRefinement::Always(set) => set.contains(ParamSet::IMAGE_POSES),
-        CameraRefinement::Try(candidates) => candidates.iter().any(|set| set.contains(ParamSet::IMAGE_POSES)),
-    }
+    let mut sets = choice.candidates().iter().copied().chain([choice.always()]);
+    sets.any(|set| set.contains(ParamSet::IMAGE_POSES))
 }
 
 /// Corrections for a set of parameters.
@@ -169,7 +166,8 @@ impl AlignmentScene {
         Some(CalibrationModel { set, fit, corrections })
     }
 
-    /// Estimates individual poses of the validation images, too, after all decisions: they will be trained on later.
+    /// Also estimates individual poses of the validation images, after all decisions, because these images are trained
+    /// on later.
     fn with_validation_poses(&self, mut model: CalibrationModel) -> CalibrationModel {
         let images_of_split = |split: Split| -> Vec<usize> {
             (0..self.images.len()).filter(|ix| self.images[*ix].keyframe.split == split).collect()
@@ -194,7 +192,7 @@ impl AlignmentScene {
         model
     }
 
-    /// The given corrections, restricted to the parameters of a layout.
+    /// Restricts corrections to the parameters of a layout.
     fn restricted(&self, layout: &Layout, given: &Corrections) -> Corrections {
         let mut restricted = Corrections::none(self.cameras.len());
         let values = layout.params.iter().map(|param| given.value(*param));
@@ -202,10 +200,10 @@ impl AlignmentScene {
         restricted
     }
 
-    /// Adds each candidate whose gain is significant, then removes those whose gain no longer is.
+    /// Adds each candidate whose gain is significant, then removes those whose gain is no longer significant.
     ///
-    /// Extrinsics that are not corrected may still be wrong if the motion does not make them observable. These
-    /// directions are added to `unobservable`.
+    /// If extrinsics are not corrected, they may still be wrong in directions that the motion does not make observable.
+    /// These directions are added to `unobservable`.
     fn select_params(
         &self,
         candidates: &[ParamSet],
@@ -257,9 +255,7 @@ impl AlignmentScene {
         };
         let trial = |(baseline_db, variant_db): (Vec<f64>, Vec<f64>)| {
             log::debug!("alignment: {params}: without {baseline_db:.2?}, with {variant_db:.2?} dB");
-            let mut trial = Trial::of(Candidate::Cameras(params), &baseline_db, &variant_db);
-            trial.kept &= trial.n_images >= MIN_VALIDATION_IMAGES;
-            trial
+            Trial::of(Candidate::Cameras(params), &baseline_db, &variant_db).with_enough_images()
         };
         match (params.contains(ParamSet::IMAGE_POSES), baseline.set.contains(ParamSet::IMAGE_POSES)) {
             (true, _) => trial(comparison.scores_with_free_poses()),

@@ -1,4 +1,4 @@
-//! Selection of pairs of images to compare: images that show the same surface from near and distant viewpoints.
+//! Selection of pairs of images that show the same surface, from nearby to distant viewpoints.
 
 use super::prepared_image::{PreparedImage, depth_at, point};
 use super::view::CorrectedView;
@@ -8,13 +8,14 @@ use rayon::prelude::*;
 const MIN_OVERLAP: f64 = 0.3;
 /// Number of samples that are tested for the overlap.
 const N_PROBES: usize = 40;
-/// Readings that differ by more than this fraction are of another surface; poses may be wrong by centimeters.
+/// Readings that differ by more than this fraction belong to different surfaces. The fraction is large because poses
+/// may have errors of centimeters.
 const SAME_SURFACE_FRAC: f64 = 0.1;
-/// Minimum distance of a partner, in radians plus the translation divided by the depth; smaller ones carry no
-/// information.
+/// Minimum distance of a partner: the rotation in radians plus the translation divided by the depth. Closer partners
+/// carry no information.
 const MIN_MOTION: f64 = 0.01;
 
-/// Samples of image `from` are compared with image `to`.
+/// A pair of images: samples of image `from` are compared with image `to`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Pair {
     pub(super) from: usize,

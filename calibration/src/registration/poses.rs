@@ -1,4 +1,4 @@
-//! Estimation of individual pose corrections of images: many unknowns, with each pair constraining two images.
+//! Estimates pose corrections of individual images. There are many unknowns, but each pair constrains only two images.
 
 use super::corrections::{Corrections, rotation_and_translation, twist};
 use super::fit::{INITIAL_NOISE, OCCLUSION_FRAC};
@@ -15,18 +15,18 @@ use kinematics::{Twist, transform};
 use nalgebra::{DVector, Matrix6, Vector6};
 use std::collections::BTreeMap;
 
-/// Bounds of the expected pose error of an image, meters and radians. The lower bound corresponds to the accuracy of
-/// arms.
+/// Bounds of the expected pose error of an image, meters and radians. The lower bound (next constant) is the accuracy
+/// of arms.
 const MAX_POSE_ERROR: [f64; 2] = [0.02, 0.02];
 const MIN_POSE_ERROR: [f64; 2] = [2e-4, 3.5e-4];
 const MAX_ITERATIONS: [usize; 4] = [6, 4, 4, 6];
 const MAX_STEP: f64 = 2.0;
 
-/// Estimates the poses of all images that are connected by pairs, starting from given corrections. Other images get
-/// the interpolated drift of their neighbors, weighted by its predictability.
+/// Estimates the poses of all images that are connected by pairs, starting from given corrections. Other images get the
+/// interpolated drift of their neighbors, weighted by its predictability.
 ///
-/// The expected pose error is estimated from the corrections themselves, level by level: if almost all poses are
-/// right, noise moves none.
+/// The expected pose error is estimated from the corrections themselves at each level. If almost all poses are correct,
+/// it becomes small, so noise does not move them.
 pub(super) fn fit(images: &[PreparedImage], pairs: &[Pair], from: &Corrections) -> Option<Corrections> {
     let layout = Layout::default();
     let mut corrections = from.clone();
@@ -79,8 +79,8 @@ pub(super) fn fit(images: &[PreparedImage], pairs: &[Pair], from: &Corrections) 
 }
 
 /// Estimates the pose of one image relative to others that stay fixed, from a subset of its pixels. All `pairs` must
-/// lead to this image. Returns its camera's correction with an entry for it; `None` if the other images do not show
-/// the same surfaces.
+/// lead to this image. Returns the correction of its camera with an entry for this image; `None` if the other images do
+/// not show the same surfaces.
 pub(super) fn fit_one(
     images: &[PreparedImage],
     views: &[CorrectedView],
@@ -90,7 +90,7 @@ pub(super) fn fit_one(
 ) -> Option<CameraCorrection> {
     let image = &images[pairs.first()?.to];
     let mut image_correction = correction.clone();
-    // Start from its current drift, as an entry of its own.
+    // The image gets its own entry, which starts at its current drift.
     image_correction.drift.insert(image.keyframe.stamp.0, correction.drift_at(image.keyframe.stamp));
     let scales = scales(MAX_POSE_ERROR);
     let mut total = Vector6::zeros();
@@ -138,11 +138,11 @@ fn median_depth_m(images: &[PreparedImage]) -> f64 {
     quantile(&mut depths, 0.5, Rank::Upper).unwrap_or(1.0)
 }
 
-/// Removes from the steps the significant part of the mean correction of a camera's images, because other parameters
-/// explain it.
+/// Removes the significant part of the mean correction of a camera's images from the steps, because other parameters
+/// explain that part.
 ///
-/// A mean within its tolerance stays: independent errors have a nonzero mean, too, and removing it would leave the
-/// images misaligned.
+/// A mean within its tolerance is not removed: independent errors have a nonzero mean, too, and removing it would leave
+/// the images misaligned.
 fn remove_mean(
     steps: &mut [Vector6<f64>],
     total: &[Vector6<f64>],
@@ -183,7 +183,7 @@ fn apply_step(correction: &mut CameraCorrection, image: &PreparedImage, step: &V
 /// Blocks of the normal equations, scaled by the expected pose errors.
 struct NormalEquations {
     diagonal: Vec<Matrix6<f64>>,
-    /// For each pair: the slots of its first image (rows) and second image (columns), and the block.
+    /// For each pair, the slots of its first image (rows) and second image (columns), and the block between them.
     off_diagonal: Vec<(usize, usize, Matrix6<f64>)>,
     rhs: Vec<Vector6<f64>>,
 }
@@ -224,7 +224,7 @@ impl NormalEquations {
         product
     }
 
-    /// Conjugate gradients, preconditioned by the blocks on the diagonal.
+    /// Solves the equations by conjugate gradients, preconditioned by the blocks on the diagonal.
     fn solve(&self) -> Vec<Vector6<f64>> {
         const MAX_CG_ITERATIONS: usize = 60;
         const TOLERANCE: f64 = 1e-8;

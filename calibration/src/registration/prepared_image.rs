@@ -10,12 +10,13 @@ use keyframe::{DepthMap, Keyframe};
 use nalgebra::Vector3;
 use std::sync::Arc;
 
-/// Maximum width of the finest level: a hundredth of its pixels is far below the accuracy that calibrations need.
+/// Maximum width of the finest level, pixels. At this width, errors of a hundredth of a pixel are far below the
+/// accuracy that calibration needs.
 const MAX_COLUMNS: u32 = 400;
 /// Minimum side of the coarsest level.
 const MIN_SIDE: usize = 40;
 const MAX_LEVELS: usize = 4;
-/// Grid of an image; each cell contributes its most informative sample.
+/// Columns and rows of the grid of an image. Each cell contributes its most informative sample.
 const GRID_CELLS: [usize; 2] = [20, 15];
 /// Maximum relative difference of a sample's depth from its neighbors, and between readings that are interpolated.
 const SMOOTH_FRAC: f64 = 0.03;
@@ -43,7 +44,7 @@ pub(super) struct DepthSample {
     pub(super) z_m: f64,
 }
 
-/// Brightness, 0 to 255, with its gradient.
+/// A gray image (0 to 255) with its gradient.
 #[derive(Debug)]
 pub(super) struct GrayImage {
     size: [usize; 2],
@@ -81,14 +82,14 @@ impl PreparedImage {
         Some(image)
     }
 
-    /// Brightness at a level, or at the coarsest level if there are fewer.
+    /// The gray image at a level, or at the coarsest level if there are fewer levels.
     pub(super) fn level(&self, level: usize) -> &GrayImage {
         &self.levels[level.min(self.levels.len() - 1)]
     }
 }
 
-/// Color pixel of a sample with the uncorrected cameras. The rolling shutter is ignored, because this is only used
-/// for selection.
+/// Pixel of a sample in the color image, with uncorrected cameras. The rolling shutter is ignored, because the pixel is
+/// used only to select samples.
 fn color_pixel(keyframe: &Keyframe, depth: &DepthMap, sample: &DepthSample) -> Option<[f64; 2]> {
     let in_depth = point(depth.focal_px, depth.principal_px, sample);
     let at = keyframe.world_from_camera.inverse() * depth.world_from_camera * nalgebra::Point3::from(in_depth);
@@ -101,7 +102,7 @@ pub(super) fn point(focal_px: [f64; 2], principal_px: [f64; 2], sample: &DepthSa
     Vector3::new(ray[0], ray[1], 1.0) * sample.z_m
 }
 
-/// Selects the sample with the largest gradient, and the central one, of every cell.
+/// Selects, in every cell, the sample with the largest gradient and the central sample.
 fn select_samples(
     depth: &DepthMap,
     gradient_norm: impl Fn(&DepthSample) -> Option<f64>,
@@ -154,8 +155,8 @@ fn sample(depth: &DepthMap, x: usize, y: usize) -> Option<DepthSample> {
             if (neighbor - z_m).abs() > SMOOTH_FRAC * z_m {
                 return None;
             }
-            // Uses readings in opposite pairs, so that a slanted surface does not bias the mean. Averages inverse
-            // depths, which are linear on a plane.
+            // Readings are used in opposite pairs, so that a slanted surface does not bias the mean. Inverse depths are
+            // averaged, because they are linear on a plane.
             if at(x + RADIUS - dx, y + RADIUS - dy) > 0.0 {
                 sum += 1.0 / neighbor;
                 n += 1.0;
@@ -222,8 +223,8 @@ fn levels(keyframe: &Keyframe) -> Vec<GrayImage> {
     levels
 }
 
-/// Binomial blur, five pixels wide. Interpolated values have less noise than values at pixel centers; without the
-/// blur, this would bias images towards half-pixel offsets.
+/// Blurs with a binomial filter, five pixels wide. Interpolated values have less noise than values at pixel centers;
+/// without the blur, this would bias estimates towards half-pixel offsets.
 fn blurred([width, height]: [usize; 2], values_in: &[f32]) -> Vec<f32> {
     const WEIGHTS: [f32; 5] = [1.0 / 16.0, 4.0 / 16.0, 6.0 / 16.0, 4.0 / 16.0, 1.0 / 16.0];
     let blur_along = |values: &[f32], n: usize, stride: usize, coordinate: &dyn Fn(usize) -> usize| -> Vec<f32> {

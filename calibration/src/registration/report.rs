@@ -3,11 +3,18 @@
 use super::fit::Fit;
 use super::layout::CalibrationParam;
 use super::solve::Solution;
-use super::{AlignmentScene, CalibrationModel, MIN_VALIDATION_IMAGES};
-use crate::{CameraCorrection, Candidate, ParamSet, Trial};
+use super::{AlignmentScene, CalibrationModel};
+use crate::{CalibratedCamera, CameraCorrection, Candidate, MIN_VALIDATION_IMAGES, ParamSet, Trial};
+use keyframe::Keyframe;
 use nalgebra::{DVector, Vector3};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
+
+/// Smaller differences between two alignments do not matter: rotation of the camera (0.03 degrees), translation, and
+/// relative change of the focal length.
+const NOTICEABLE_RAD: f64 = 5e-4;
+const NOTICEABLE_M: f64 = 5e-4;
+const NOTICEABLE_FOCAL: f64 = 1e-3;
 
 /// Result of alignment.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -33,7 +40,7 @@ pub enum Estimate {
     HandEye(PoseEstimate),
     /// Correction of the pose of the depth frame in the color frame, in the axes of the color frame.
     DepthPose(PoseEstimate),
-    /// Time by which images were taken later than their stamps, seconds.
+    /// Time from the stamps of the images to their exposure, seconds.
     TimeOffset(ScalarEstimate),
     /// Factor to apply to depth readings, minus 1.
     DepthScale(ScalarEstimate),
@@ -106,7 +113,8 @@ pub struct ScalarEstimate {
     pub sigma: f64,
 }
 
-/// A direction that the motion does not make observable: changing all its parts together changes no residual.
+/// A direction in parameter space that the motion does not make observable: changing all its parts together changes no
+/// residual.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Unobservable {
     /// Descriptions of the parts.
@@ -149,7 +157,8 @@ pub(super) fn alignment(
     Alignment { corrections, estimates, unobservable, trials, n_pairs: scene.pairs.len() }
 }
 
-/// Estimate for a parameter; `None` unless it is the first of its group.
+/// The estimate of the group of parameters that starts with a parameter; `None` if the parameter is not the first of
+/// its group.
 fn estimate(
     scene: &AlignmentScene,
     kept: &CalibrationModel,
@@ -228,7 +237,7 @@ fn pose_estimate(
     }
 }
 
-/// Directions that are not observable in a fit.
+/// Unobservable directions of a fit.
 pub(super) fn unobservable(scene: &AlignmentScene, fit: &Fit) -> Vec<Unobservable> {
     let is_not_translation = |ix: usize| {
         !matches!(fit.layout.params[ix], CalibrationParam::Extrinsics(_, 0..3) | CalibrationParam::DepthPose(_, 0..3))
@@ -252,10 +261,10 @@ fn describe(scene: &AlignmentScene, params: &[CalibrationParam], direction: &DVe
         let name = |camera: usize| &scene.cameras[camera];
         parts.extend(match *param {
             CalibrationParam::Extrinsics(camera, 0) if is_significant(ix, 3) => {
-                Some(format!("translation of camera {:?} along {} of its own axes", name(camera), axis(ix)))
+                Some(format!("translation of camera {:?} along its own {} axis", name(camera), axis(ix)))
             }
             CalibrationParam::Extrinsics(camera, 3) if is_significant(ix, 3) => {
-                Some(format!("rotation of camera {:?} about {} of its own axes", name(camera), axis(ix)))
+                Some(format!("rotation of camera {:?} about its own {} axis", name(camera), axis(ix)))
             }
             CalibrationParam::DepthPose(camera, 0) if is_significant(ix, 3) => {
                 Some(format!("translation of the depth frame of camera {:?} along {}", name(camera), axis(ix)))
@@ -292,6 +301,21 @@ impl Alignment {
     /// Whether any correction was accepted.
     pub fn has_corrections(&self) -> bool {
         !self.corrections.is_empty()
+    }
+
+    /// Whether another alignment places the camera of a keyframe noticeably differently.
+    pub(crate) fn differs(&self, other: &Self, keyframe: &Keyframe) -> bool {
+        let keyframe = Keyframe { rgba_srgb: [].into(), depth: None, ..keyframe.clone() };
+        let camera = |alignment: &Self| match alignment.corrections.get(&*keyframe.camera) {
+            Some(correction) => correction.apply(&keyframe),
+            None => CalibratedCamera::of(&keyframe),
+        };
+        let (here, there) = (camera(self), camera(other));
+        let motion = here.world_from_camera.inverse() * there.world_from_camera;
+        let focal_change = (0..2).map(|axis| (there.focal_px[axis] / here.focal_px[axis] - 1.0).abs());
+        motion.rotation.angle() > NOTICEABLE_RAD
+            || motion.translation.vector.norm() > NOTICEABLE_M
+            || focal_change.fold(0.0, f64::max) > NOTICEABLE_FOCAL
     }
 
     /// Whether there were enough validation images for decisions.

@@ -9,7 +9,7 @@ use super::prepared_image::{DepthSample, GrayImage, PreparedImage, depth_at, poi
 use super::view::CorrectedView;
 use nalgebra::Vector3;
 
-/// Two images count as equally fine up to this factor.
+/// Resolutions that differ by at most this factor count as equal.
 const HALF_OCTAVE: f64 = std::f64::consts::SQRT_2;
 
 /// An image with its corrected view.
@@ -22,11 +22,11 @@ pub(super) struct Side<'a> {
 /// A point as observed in one of the two images.
 #[derive(Clone, Copy, Debug)]
 struct ObservedPoint {
-    /// Position in the color camera at mid-exposure.
+    /// Position in the color camera frame at mid-exposure.
     still: Vector3<f64>,
-    /// When its row is read.
+    /// Position in the color camera frame when the row of the point is read.
     read: Vector3<f64>,
-    /// The row's share of the readout.
+    /// Readout time of the row as a share of the total readout time.
     share: f64,
     pixel: [f64; 2],
     brightness: f64,
@@ -38,7 +38,7 @@ struct ObservedPoint {
 pub(super) struct Correspondence {
     i: ObservedPoint,
     j: ObservedPoint,
-    /// Position of the sample in the depth camera of `i`, then in that of `j`.
+    /// Position of the sample in the depth camera of `i`. The next field is its position in the depth camera of `j`.
     point_in_depth_i: Vector3<f64>,
     in_depth: Vector3<f64>,
     depth_pixel: [f64; 2],
@@ -47,7 +47,7 @@ pub(super) struct Correspondence {
     depth_weight: f64,
 }
 
-/// Map from the brightness of `i` to that of `j`, which have different exposures.
+/// Gain and offset that map the brightness of image `i` to that of image `j`, because their exposures differ.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Tone {
     pub(super) gain: f64,
@@ -168,8 +168,8 @@ impl Correspondence {
     }
 }
 
-/// Levels at which both images have about the same resolution on the surface, neither finer than `level`: a near view
-/// has detail that a distant one lacks.
+/// Pyramid levels at which both images have about the same resolution on the surface, neither finer than `level`. A
+/// near view has detail that a distant view lacks.
 fn levels([i, j]: [Side<'_>; 2], [z_i, z_j]: [f64; 2], level: usize) -> [usize; 2] {
     let texel_m = |side: Side<'_>, z_m: f64| z_m * side.image.level(level).texel_px() / side.view.focal_px[0];
     let (of_i, of_j) = (texel_m(i, z_i), texel_m(j, z_j));
@@ -186,7 +186,7 @@ impl ObservedPoint {
     }
 }
 
-/// Columns of a pair's Jacobian that belong to the parameters of one view.
+/// Columns of the Jacobian of a pair that belong to the parameters of one view.
 #[derive(Debug)]
 pub(super) struct ParamColumns<'a> {
     view: &'a CorrectedView,
@@ -225,7 +225,7 @@ impl<'a> ParamColumns<'a> {
         Self { columns, ..Self::still(view) }
     }
 
-    /// No columns: the camera is fixed.
+    /// No columns, for a fixed camera.
     pub(super) fn still(view: &'a CorrectedView) -> Self {
         Self { view, columns: Vec::new(), depth_pose: None, lens: None, depth_scale: None, readout: None }
     }
@@ -237,8 +237,8 @@ fn gradient_by_point(view: &CorrectedView, observed: &ObservedPoint, factor: f64
     Vector3::new(sx, sy, -(sx * observed.read.x + sy * observed.read.y) / observed.read.z)
 }
 
-/// Gradient with respect to a displacement of the point at fixed readout time. Accounts for the row, and thus the
-/// readout time, changing with the displacement.
+/// Gradient with respect to a displacement of the point at its readout time. Includes the effect that a displacement
+/// changes the row, and thus the readout time.
 fn row_held_gradient(view: &CorrectedView, observed: &ObservedPoint, gradient: &Vector3<f64>) -> Vector3<f64> {
     let drift = -view.readout_secs * view.twist.apparent_velocity(&observed.still);
     let z = observed.read.z;

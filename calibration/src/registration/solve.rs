@@ -1,11 +1,12 @@
-//! One Gauss-Newton step of the shared parameters, its uncertainty, and unobservable directions.
+//! A Gauss-Newton step of the shared parameters, its uncertainty, and its unobservable directions.
 
 use super::pairs::Pair;
 use super::sums::PairSums;
 use nalgebra::{DMatrix, DVector, SymmetricEigen};
 
-/// Residuals of neighboring samples are correlated and carry as much information as this many times fewer independent
-/// ones. Used only for damping and observability; reported uncertainties are measured, see [`Solution::variance`].
+/// Factor by which the information of the residuals is reduced, because residuals of neighboring samples are
+/// correlated. Used only for damping and observability; reported uncertainties are measured, see
+/// [`Solution::variance`].
 pub(super) const INFLATION: f64 = 10.0;
 /// A direction is observable if its standard deviation is below this fraction of the parameters' scales.
 const OBSERVABLE_FRAC: f64 = 0.3;
@@ -17,15 +18,15 @@ const MAX_STEP: f64 = 2.0;
 pub(super) struct Solution {
     scales: DVector<f64>,
     eigen: SymmetricEigen<f64, nalgebra::Dyn>,
-    /// For each eigenvector, in order.
+    /// Whether each eigenvector is observable, in the order of the eigenvectors.
     is_observable: Vec<bool>,
-    /// In units of the parameters.
+    /// The step in units of the parameters.
     pub(super) step: DVector<f64>,
     covariance: DMatrix<f64>,
 }
 
 impl Solution {
-    /// Gauss-Newton step with damping towards zero. Components along unobservable directions become zero.
+    /// Computes a Gauss-Newton step that is damped towards zero. Components along unobservable directions become zero.
     ///
     /// * `scales`: typical magnitude of each parameter.
     /// * `values`: current values of the parameters.
@@ -64,9 +65,9 @@ impl Solution {
         solution
     }
 
-    /// Covariance from the scatter of the pairs' gradients, in scaled units. Assumes that pairs sharing an image have
-    /// correlated errors and that each pair has independent errors. If only one of these holds, the covariance is too
-    /// large by a factor of at most two.
+    /// Covariance from the scatter of the pairs' gradients, in scaled units. Assumes that each pair has an independent
+    /// error, and that pairs which share an image also have a common error. If only one kind of error exists, the
+    /// covariance is too large by a factor of at most two.
     ///
     /// Source: White 1980 (sandwich estimator); Aronow, Samii and Assenova 2015 (pairs that share a member).
     fn covariance(&self, pairs: &[Pair], sums: &[PairSums]) -> DMatrix<f64> {

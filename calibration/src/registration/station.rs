@@ -1,4 +1,4 @@
-//! Correction of a mobile base's pose at a new station, by registering its camera's images to earlier ones.
+//! Correction of a mobile base's pose at a new station, by registering images of the station to earlier images.
 //!
 //! The six parameters of the base's pose are estimated like those of cameras: from depth samples of one image in
 //! another, differences of brightness and depth, and Gauss-Newton steps from coarse to fine. Each pair has one image
@@ -14,7 +14,7 @@ use super::solve::Solution;
 use super::sums::{self, Noise, PixelSubset, ResidualOptions};
 use super::validation;
 use super::view::CorrectedView;
-use super::{MAX_IMAGES, MIN_PAIRS, MIN_SIGNIFICANT_SIGMAS, MIN_VALIDATION_IMAGES, PARTNERS_PER_IMAGE};
+use super::{MAX_IMAGES, MIN_PAIRS, MIN_SIGNIFICANT_SIGMAS, PARTNERS_PER_IMAGE};
 use crate::{Candidate, ParamSet, Trial};
 use keyframe::{Keyframe, Split};
 use kinematics::Transform;
@@ -24,7 +24,7 @@ use serde::Serialize;
 use std::collections::BTreeSet;
 use std::sync::Arc;
 
-/// Typical errors of the base's pose, meters and radians.
+/// Typical errors of the base pose, meters and (next constant) radians.
 const PRIOR_TRANSLATION_M: f64 = 0.02;
 const PRIOR_ROTATION_RAD: f64 = 0.0175;
 
@@ -33,8 +33,8 @@ const PRIOR_ROTATION_RAD: f64 = 0.0175;
 const MAX_ITERATIONS: usize = 20;
 /// A step smaller than this number of standard deviations ends a level, the finest first.
 const CONVERGED_STEP_SIGMAS: [f64; 4] = [0.1, 0.3, 0.3, 0.3];
-/// Factor on the noise of brightness. Between two stations, brightness has the same errors in all pairs, near
-/// occlusions and reflections; depth does not.
+/// Factor on the brightness noise. Near occlusions and reflections, brightness has the same errors in all pairs of two
+/// stations; depth does not.
 const BRIGHTNESS_NOISE_INFLATION: f64 = 4.0;
 
 /// Correction of the reported pose of a base at a station. Each sigma is a standard deviation.
@@ -91,13 +91,13 @@ pub fn register_station(
         standard_error_db: trial.standard_error_db,
         n_validation_images: trial.n_images,
         n_pairs: scene.pairs.len(),
-        kept: trial.kept && trial.n_images >= MIN_VALIDATION_IMAGES && (0..6).any(is_significant),
+        kept: trial.kept && (0..6).any(is_significant),
     })
 }
 
 impl StationCorrection {
-    /// Transform to apply from the left to poses on the base that is reported at `world_from_base`; identity unless
-    /// the correction is accepted.
+    /// Transform by which poses must be multiplied from the left to correct them. It is the identity unless the
+    /// correction is accepted. `world_from_base` is the reported pose of the base.
     ///
     /// * `share`: fraction of the path to the station, 0 to 1, because the error grows along the path.
     pub fn map_from_odom(&self, world_from_base: &Transform, share: f64) -> Transform {
@@ -126,7 +126,7 @@ impl std::fmt::Display for StationCorrection {
     }
 }
 
-/// Motion of everything on a base that is translated and rotated about its own position.
+/// World-frame motion of a base that is translated, and rotated about its own position.
 fn base_motion(world_from_base: &Transform, translation_m: &Vector3<f64>, rotation_rad: &Vector3<f64>) -> Transform {
     let position = world_from_base.translation.vector;
     let rotation = UnitQuaternion::from_scaled_axis(*rotation_rad);
@@ -207,12 +207,12 @@ impl StationScene {
         (scene.pairs.len() >= MIN_PAIRS).then_some(scene)
     }
 
-    /// Views with the base moved by the estimate. Those of the new station move along, with columns for a further
-    /// motion.
+    /// Views with the base moved by the estimate. Only views of the new station move; they have columns for a further
+    /// motion of the base.
     fn views(&self, estimate: &DVector<f64>) -> Vec<CorrectedView> {
         let part = |begin: usize| Vector3::from_fn(|row, _| estimate[begin + row]);
         let motion = base_motion(&self.world_from_base, &part(0), &part(3));
-        // The axes of the world, at the position of the base.
+        // A frame with the axes of the world at the position of the base.
         let world_from_pivot = Transform::from_parts(
             (self.world_from_base.translation.vector + part(0)).into(),
             UnitQuaternion::identity(),
@@ -256,7 +256,7 @@ impl StationScene {
         Some((estimate, last?, noise))
     }
 
-    /// Evaluates how much better validation images of each side are predicted from the other.
+    /// Evaluates how much the estimate improves the prediction of validation images of each station from the other.
     fn evaluate(&self, estimate: &DVector<f64>, noise: Noise) -> Trial {
         let views = [&DVector::zeros(6), estimate].map(|estimate| self.views(estimate));
         let validation_image_of = |pair: &Pair| {
@@ -265,11 +265,11 @@ impl StationScene {
         let (baseline_db, variant_db) =
             validation::scores(&self.images, &self.validation_pairs, &views, noise, validation_image_of);
         log::debug!("station: without {baseline_db:.2?}, with {variant_db:.2?} dB");
-        Trial::of(Candidate::Cameras(ParamSet::empty()), &baseline_db, &variant_db)
+        Trial::of(Candidate::Cameras(ParamSet::empty()), &baseline_db, &variant_db).with_enough_images()
     }
 }
 
-/// Composes a motion with a small one that follows it.
+/// Composes a motion with a small motion that follows it.
 fn compose_step(estimate: &DVector<f64>, step: &DVector<f64>) -> DVector<f64> {
     let rotation = |of: &DVector<f64>| UnitQuaternion::from_scaled_axis(Vector3::from_fn(|row, _| of[3 + row]));
     let composed_rotation = (rotation(step) * rotation(estimate)).scaled_axis();
@@ -279,6 +279,7 @@ fn compose_step(estimate: &DVector<f64>, step: &DVector<f64>) -> DVector<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::MIN_VALIDATION_IMAGES;
     use crate::scenes::{Miscalibration, capture};
 
     /// Reported pose of the base at the second station.

@@ -1,4 +1,4 @@
-//! Normal equations of pairs: robustly weighted, with gain and offset of each pair eliminated.
+//! Normal equations of pairs with robust weights; gain and offset of each pair are eliminated.
 
 use super::pairs::Pair;
 use super::prepared_image::{DepthSample, PreparedImage};
@@ -8,10 +8,10 @@ use kinematics::quantile::{Rank, quantile};
 use nalgebra::{DMatrix, DVector};
 use rayon::prelude::*;
 
-/// Residuals of this many standard deviations get a weight of one half (Cauchy weights; 95 % as efficient as least
-/// squares for normal noise).
+/// Number of standard deviations at which residuals get half the full weight (Cauchy weights, 95 % as efficient as
+/// least squares for normal noise).
 const CAUCHY_SCALE: f64 = 2.385;
-/// Standard deviations of the priors on gain (around 1) and offset (around 0).
+/// Standard deviation of the prior on the gain, around 1. The next constant is that of the offset, around 0.
 const PRIOR_GAIN_DEVIATION: f64 = 0.2;
 const PRIOR_OFFSET: f64 = 30.0;
 /// Minimum number of samples of a pair.
@@ -39,7 +39,8 @@ pub(super) struct ResidualOptions {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum PixelSubset {
     All,
-    /// Blocks of one color of a checkerboard: poses estimated on one half are evaluated on the other.
+    /// Every second block, as in a checkerboard: poses are estimated on one half of the blocks and evaluated on the
+    /// other.
     Blocks {
         odd: bool,
     },
@@ -89,7 +90,7 @@ pub(super) fn sides<'a>(images: &'a [PreparedImage], views: &'a [CorrectedView],
     [pair.from, pair.to].map(|ix| Side { image: &images[ix], view: &views[ix] })
 }
 
-/// Gain and offset by iteratively reweighted least squares.
+/// Estimates gain and offset by iteratively reweighted least squares.
 pub(super) fn tone<'a>(correspondences: impl Iterator<Item = &'a Correspondence> + Clone, noise: f64) -> Tone {
     const MAX_ITERATIONS: usize = 3;
     let mut tone = Tone { gain: 1.0, offset: 0.0 };
@@ -221,7 +222,7 @@ fn of_pair(
 
 /// Scatter of the residuals of all pairs, from their median; `None` without residuals.
 pub(super) fn noise_of(sums: &[PairSums]) -> Option<Noise> {
-    /// Noise of a perfect sensor: rounding to bytes and to a tenth of a millimeter.
+    /// Lower limit of the noise: rounding to bytes and to a tenth of a millimeter.
     const MIN_NOISE: Noise = Noise { photo: 0.3, depth: 5e-5 };
     let scatter = |of: fn(&PairSums) -> &[f64]| {
         let mut all: Vec<f64> = sums.iter().flat_map(|pair| of(pair).iter().copied()).collect();

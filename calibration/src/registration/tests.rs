@@ -51,7 +51,7 @@ fn wrong_depth_pose_is_found() {
     let alignment =
         align_given(&Miscalibration { depth_pose: deviation, ..Miscalibration::none() }, ParamSet::DEPTH_POSE);
     let correction = &alignment.corrections["wrist"];
-    // The input is true * deviation; the correction is applied on the left of color_from_depth.
+    // The input pose is the true pose times the deviation; the correction is applied from the left to color_from_depth.
     let base = Transform::new(Vector3::new(0.02, 0.0, 0.0), Vector3::zeros());
     let estimated = crate::rigid_transform(correction.depth_rotation_rad.into(), correction.depth_translation_m.into())
         * base
@@ -280,7 +280,7 @@ fn drifting_image_poses_are_corrected() {
     let keyframes: Vec<Arc<Keyframe>> = capture(&Miscalibration::none())
         .iter()
         .map(|keyframe| {
-            // Smooth errors of millimeters, as of a SLAM system; the motion is unknown.
+            // Smooth errors of millimeters, like those of a SLAM system; the motion is unknown.
             let secs = keyframe.stamp.0 as f64 * 1e-9;
             let wave = |hz: f64, phase: f64| (6.3 * hz * secs + phase).sin();
             let drift = Transform::new(

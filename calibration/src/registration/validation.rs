@@ -1,4 +1,4 @@
-//! Evaluation of corrections: prediction of validation images from training images, with and without them.
+//! Evaluation of corrections: predicts validation images from training images with and without them.
 
 use super::corrections::Corrections;
 use super::layout::Layout;
@@ -11,10 +11,11 @@ use super::view::CorrectedView;
 use rayon::prelude::*;
 use std::collections::BTreeMap;
 
-/// Differences beyond this are due to another surface or a highlight, on a scale of 0 to 255.
+/// Maximum brightness difference that counts, on a scale of 0 to 255. Larger differences come from other surfaces or
+/// highlights.
 const CLIP: f64 = 50.0;
-/// Noise of an image on a scale of 0 to 255: smaller differences are invisible. The blurred images that are compared
-/// have less noise.
+/// Noise that is added to each squared difference, on a scale of 0 to 255, so that differences below the noise of a
+/// camera image do not count. The blurred images that are compared have less noise.
 const IMAGE_NOISE: f64 = 2.0;
 const OCCLUSION_FRAC: f64 = 0.04;
 /// Minimum number of samples of a score.
@@ -24,7 +25,7 @@ const MIN_SAMPLES: usize = 30;
 #[derive(Clone, Copy, Debug)]
 pub(super) struct PairedComparison<'a> {
     pub(super) images: &'a [PreparedImage],
-    /// From training images to validation images.
+    /// Pairs from training images to validation images.
     pub(super) pairs: &'a [Pair],
     pub(super) baseline: &'a Corrections,
     pub(super) variant: &'a Corrections,

@@ -1,4 +1,4 @@
-//! Views of images with the current corrections, and their motions with each parameter.
+//! Views of images with the current corrections, and their derivatives with respect to each parameter.
 
 use super::layout::Layout;
 use super::prepared_image::PreparedImage;
@@ -6,7 +6,7 @@ use crate::CameraCorrection;
 use kinematics::{Transform, Twist};
 use nalgebra::{Matrix3, Vector3};
 
-/// A rigid motion with a rotation matrix, which is faster on many points.
+/// A rigid motion with a rotation matrix, which transforms many points faster than a quaternion.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct RigidTransform {
     pub(super) rotation: Matrix3<f64>,
@@ -45,7 +45,7 @@ pub(super) struct CorrectedView {
     pub(super) depth_focal_px: [f64; 2],
     pub(super) depth_principal_px: [f64; 2],
     pub(super) depth_factor: f64,
-    /// Motion of the camera with each parameter, in its own axes: index, meters and radians.
+    /// Motion of the camera per unit of each parameter, in the camera's axes: parameter index, meters, radians.
     pub(super) columns: Vec<(usize, Vector3<f64>, Vector3<f64>)>,
     pub(super) depth_pose: Option<usize>,
     pub(super) lens: Option<usize>,
@@ -106,8 +106,8 @@ impl CorrectedView {
         })
     }
 
-    /// The view with another camera pose, moving rigidly with a frame. Parameters 0 to 5 are the motion of the frame
-    /// in its own axes: meters, then radians.
+    /// The view with another camera pose, on a camera that moves rigidly with a frame. Parameters 0 to 5 are the motion
+    /// of the frame in its own axes: meters, then radians.
     pub(super) fn moved_with_frame(&self, world_from_camera: &Transform, world_from_frame: &Transform) -> Self {
         let frame_from_camera = world_from_frame.inverse() * world_from_camera;
         let unit = |axis: usize| Vector3::from_fn(|row, _| if row == axis { 1.0 } else { 0.0 });
@@ -133,8 +133,8 @@ impl CorrectedView {
         params
     }
 
-    /// Position of a static point at the readout time of its row, from its position at mid-exposure; and the share of
-    /// the readout.
+    /// Computes the camera-frame position of a static point at the readout time of its row from its position at
+    /// mid-exposure. Also returns that time as a share of the total readout time.
     pub(super) fn at_readout(&self, still: &Vector3<f64>) -> (Vector3<f64>, f64) {
         if self.readout_secs == 0.0 {
             return (*still, 0.0);

@@ -1,15 +1,16 @@
 //! Errors in rig files.
 
+use std::borrow::Cow;
 use std::path::PathBuf;
 
-/// Why a rig file was rejected. The message names the file, the line and the key.
+/// The reason why a rig file was rejected. The message names the file, the line and the key.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum ConfigError {
     /// A file is missing or unreadable.
     #[error("cannot read {description} {path:?}")]
     Read {
-        /// What the file contains, with an article.
+        /// Contents of the file, with an article.
         description: &'static str,
         /// Its path.
         path: PathBuf,
@@ -44,9 +45,9 @@ pub enum ConfigError {
         /// Dotted path of the key.
         key: String,
         /// Meaning of the key, or its allowed values.
-        meaning: &'static str,
+        meaning: Cow<'static, str>,
     },
-    /// A value outside the allowed ones.
+    /// A value is not allowed.
     #[error("{at}: {key} is {got}, allowed: {allowed}")]
     InvalidValue {
         /// Where the value is set.
@@ -57,6 +58,14 @@ pub enum ConfigError {
         got: String,
         /// The allowed values.
         allowed: String,
+    },
+    /// The rig file has several problems.
+    #[error("{first}{}", .others.iter().map(|other| format!("\n  also: {other}")).collect::<String>())]
+    Several {
+        /// The problem that is most likely the cause of others.
+        first: Box<Self>,
+        /// The other problems.
+        others: Vec<Self>,
     },
     /// The robot description does not match the rig file.
     #[error("{file}: {key}: {reason}")]

@@ -1,16 +1,18 @@
-//! Reads and checks the keys of a TOML table one by one. Keys that are never read are unknown keys.
+//! A TOML table whose keys are read one by one. Keys that are never read are unknown keys.
 //!
 //! Problems are collected, so that a misspelled key is reported as such and not as a missing key.
 
 use super::error::{ConfigError, SourceLocation};
+use std::borrow::Cow;
 use std::cell::RefCell;
 use std::collections::{BTreeMap, BTreeSet};
-use std::net::SocketAddr;
-use std::ops::RangeInclusive;
 use toml::de::{DeTable, DeValue};
 use toml::{Table, Value};
 
-/// State while a rig file is read.
+/// Keys that are less similar than this (Jaro-Winkler) are not suggested for an unknown key.
+const MIN_SIMILARITY: f64 = 0.75;
+
+/// State shared by all sections while a rig file is read.
 #[derive(Debug)]
 pub(super) struct ParseContext {
     file: String,
@@ -35,11 +37,28 @@ impl ParseContext {
         Ok(Self { file: file.to_owned(), lines, flags, problems: RefCell::default(), accessed: RefCell::default() })
     }
 
-    /// The problem to report, if there is one. Unknown keys come first, because they explain missing ones.
+    /// The problems, if there are any, as one error. Unknown keys come first, because they explain missing keys.
     pub(super) fn into_problem(self) -> Option<ConfigError> {
-        let mut problems = self.problems.into_inner();
-        let first = problems.iter().position(|problem| matches!(problem, ConfigError::UnknownKey { .. })).unwrap_or(0);
-        (!problems.is_empty()).then(|| problems.swap_remove(first))
+        let is_unknown = |problem: &ConfigError| matches!(problem, ConfigError::UnknownKey { .. });
+        let (mut problems, others): (Vec<_>, Vec<_>) = self.problems.into_inner().into_iter().partition(is_unknown);
+        problems.sort_by_key(|problem| match problem {
+            ConfigError::UnknownKey { at: SourceLocation::Line { line, .. }, .. } => *line,
+            _ => 0,
+        });
+        let meant = |key: &str| {
+            problems
+                .iter()
+                .any(|problem| matches!(problem, ConfigError::UnknownKey { nearest: Some(meant), .. } if meant == key))
+        };
+        let is_meant = |problem: &ConfigError| matches!(problem, ConfigError::Missing { key, .. } if meant(key));
+        let others: Vec<_> = others.into_iter().filter(|problem| !is_meant(problem)).collect();
+        problems.extend(others);
+        let first = (!problems.is_empty()).then(|| problems.remove(0))?;
+        Some(if problems.is_empty() {
+            first
+        } else {
+            ConfigError::Several { first: Box::new(first), others: problems }
+        })
     }
 
     /// Every key read so far.
@@ -110,7 +129,7 @@ impl<'a> Section<'a> {
         for key in self.table.keys() {
             let close = |known: &&&str| (strsim::jaro_winkler(key, known) * 1000.0).round();
             let nearest = self.known.iter().max_by(|a, b| close(a).total_cmp(&close(b)));
-            let nearest = nearest.filter(|known| strsim::jaro_winkler(key, known) > 0.7);
+            let nearest = nearest.filter(|known| strsim::jaro_winkler(key, known) > MIN_SIMILARITY);
             let path = join(&self.path, key);
             self.context.report(ConfigError::UnknownKey {
                 at: self.context.location(&path),
@@ -120,9 +139,14 @@ impl<'a> Section<'a> {
         }
     }
 
-    /// A table inside this one; an absent one reads as empty.
+    /// Returns an empty table instead of a table inside this one.
+    pub(super) fn empty_section(&self, key: &str) -> Self {
+        self.inner(key, key, Table::new())
+    }
+
+    /// A table inside this one. An absent table reads as an empty one.
     pub(super) fn section(&mut self, key: &'static str) -> Self {
-        self.optional_section(key).unwrap_or_else(|| self.inner(key, key, Table::new()))
+        self.optional_section(key).unwrap_or_else(|| self.empty_section(key))
     }
 
     /// A table inside this one; `None` if absent.
@@ -157,120 +181,20 @@ impl<'a> Section<'a> {
         }
     }
 
-    /// A number within a range; `None` if absent or invalid.
-    pub(super) fn number(&mut self, key: &'static str, range: RangeInclusive<f64>) -> Option<f64> {
-        let value = self.take(key)?;
-        match as_number(&value).filter(|number| range.contains(number)) {
-            Some(number) => Some(number),
-            None => self.invalid(key, &value, &format!("{} to {}", range.start(), range.end())),
-        }
-    }
-
-    /// A nonnegative whole number within a range; `None` if absent or invalid.
-    pub(super) fn whole(&mut self, key: &'static str, range: RangeInclusive<u64>) -> Option<u64> {
-        let value = self.take(key)?;
-        match value.as_integer().and_then(|number| u64::try_from(number).ok()).filter(|number| range.contains(number)) {
-            Some(number) => Some(number),
-            None => self.invalid(key, &value, &format!("whole numbers from {} to {}", range.start(), range.end())),
-        }
-    }
-
-    /// A whole number within a range, which may be negative; `None` if absent or invalid.
-    pub(super) fn integer(&mut self, key: &'static str, range: RangeInclusive<i64>) -> Option<i64> {
-        let value = self.take(key)?;
-        match value.as_integer().filter(|number| range.contains(number)) {
-            Some(number) => Some(number),
-            None => self.invalid(key, &value, &format!("whole numbers from {} to {}", range.start(), range.end())),
-        }
-    }
-
-    /// `true` or `false`; `None` if absent or invalid.
-    pub(super) fn flag(&mut self, key: &'static str) -> Option<bool> {
-        let value = self.take(key)?;
-        value.as_bool().or_else(|| self.invalid(key, &value, "true or false"))
-    }
-
-    /// A string; `None` if absent or invalid.
-    pub(super) fn text(&mut self, key: &'static str) -> Option<String> {
-        match self.take(key)? {
-            Value::String(text) => Some(text),
-            other => self.invalid(key, &other, "text in quotes"),
-        }
-    }
-
-    /// An IP address with a port; `None` if absent or invalid.
-    pub(super) fn address(&mut self, key: &'static str) -> Option<SocketAddr> {
-        let text = self.text(key)?;
-        let allowed = "an IP address and a port in quotes, such as \"127.0.0.1:7010\"";
-        text.parse().ok().or_else(|| self.invalid(key, &Value::String(text), allowed))
-    }
-
-    /// A list of strings; `None` if absent or invalid.
-    pub(super) fn texts(&mut self, key: &'static str) -> Option<Vec<String>> {
-        let value = self.take(key)?;
-        let texts =
-            value.as_array().and_then(|list| list.iter().map(|text| text.as_str().map(str::to_owned)).collect());
-        texts.or_else(|| self.invalid(key, &value, "a list of strings in quotes"))
-    }
-
-    /// Exactly `N` numbers within a range; `None` if absent or invalid.
-    pub(super) fn numbers<const N: usize>(
+    /// Converts the value of a key; `None` if it is absent or invalid.
+    pub(super) fn parse<T>(
         &mut self,
         key: &'static str,
-        range: RangeInclusive<f64>,
-    ) -> Option<[f64; N]> {
+        convert: impl FnOnce(&Value) -> Option<T>,
+        allowed: impl FnOnce() -> String,
+    ) -> Option<T> {
         let value = self.take(key)?;
-        let numbers: Option<Vec<f64>> = value
-            .as_array()
-            .and_then(|list| list.iter().map(|item| as_number(item).filter(|n| range.contains(n))).collect());
-        match numbers.and_then(|numbers| <[f64; N]>::try_from(numbers).ok()) {
-            Some(numbers) => Some(numbers),
-            None => self.invalid(key, &value, &format!("{N} numbers from {} to {}", range.start(), range.end())),
-        }
+        convert(&value).or_else(|| self.invalid(key, &value, &allowed()))
     }
 
-    /// A list of numbers of any length; `None` if absent or invalid.
-    pub(super) fn number_list(&mut self, key: &'static str) -> Option<Vec<f64>> {
-        let value = self.take(key)?;
-        let numbers = value.as_array().and_then(|list| list.iter().map(as_number).collect());
-        numbers.or_else(|| self.invalid(key, &value, "a list of numbers"))
-    }
-
-    /// One of the given words; `None` if absent or invalid.
-    pub(super) fn choice<T: Copy>(&mut self, key: &'static str, choices: &[(&str, T)]) -> Option<T> {
-        let value = self.take(key)?;
-        let found = choices.iter().find(|(name, _)| value.as_str() == Some(name));
-        if found.is_none() {
-            let names: Vec<_> = choices.iter().map(|(name, _)| format!("{name:?}")).collect();
-            return self.invalid(key, &value, &names.join(", "));
-        }
-        found.map(|(_, choice)| *choice)
-    }
-
-    /// One of the given words, or a list of them without duplicates; `None` if absent or invalid.
-    pub(super) fn choices<T: Copy + PartialEq>(&mut self, key: &'static str, choices: &[(&str, T)]) -> Option<Vec<T>> {
-        let value = self.take(key)?;
-        let words = value.as_array().map_or(std::slice::from_ref(&value), Vec::as_slice);
-        let choice = |word: &Value| choices.iter().find(|(name, _)| word.as_str() == Some(name)).map(|found| found.1);
-        let found: Vec<T> = words.iter().filter_map(choice).collect();
-        let is_repeated = (1..found.len()).any(|ix| found[..ix].contains(&found[ix]));
-        if found.is_empty() || found.len() < words.len() || is_repeated {
-            let names: Vec<_> = choices.iter().map(|(name, _)| format!("{name:?}")).collect();
-            return self.invalid(key, &value, &format!("{}, or a list of these without duplicates", names.join(", ")));
-        }
-        Some(found)
-    }
-
-    /// A word, or a list of words without duplicates; `None` if absent or invalid.
-    pub(super) fn words(&mut self, key: &'static str) -> Option<Vec<String>> {
-        let value = self.take(key)?;
-        let words = value.as_array().map_or(std::slice::from_ref(&value), Vec::as_slice);
-        let words: Option<Vec<String>> = words.iter().map(|word| word.as_str().map(str::to_owned)).collect();
-        let is_repeated = |words: &[String]| (1..words.len()).any(|ix| words[..ix].contains(&words[ix]));
-        match words.filter(|words| !words.is_empty() && !is_repeated(words)) {
-            Some(words) => Some(words),
-            None => self.invalid(key, &value, "a word in quotes, or a list of these without duplicates"),
-        }
+    /// Whether the file or a flag sets a key that is not yet read.
+    pub(super) fn has(&self, key: &str) -> bool {
+        self.table.contains_key(key)
     }
 
     /// Where the value of a key comes from.
@@ -278,25 +202,14 @@ impl<'a> Section<'a> {
         self.context.location(&join(&self.path, key))
     }
 
-    /// A list of the given words without duplicates, which may be empty; `None` if absent or invalid.
-    pub(super) fn choices_or_none<T: Copy + PartialEq>(
-        &mut self,
-        key: &'static str,
-        choices: &[(&str, T)],
-    ) -> Option<Vec<T>> {
-        if self.table.get(key).and_then(Value::as_array).is_some_and(Vec::is_empty) {
-            self.take(key);
-            return Some(Vec::new());
-        }
-        self.choices(key, choices)
-    }
-
     /// Reports a missing key, unless its value was just reported as invalid.
-    pub(super) fn missing(&self, key: &str, meaning: &'static str) {
+    pub(super) fn missing(&self, key: &str, meaning: impl Into<Cow<'static, str>>) {
         let key = join(&self.path, key);
-        let is_reported = |problem: &ConfigError| matches!(problem, ConfigError::InvalidValue { key: invalid, .. } if *invalid == key);
+        let is_reported =
+            |problem: &ConfigError| matches!(problem, ConfigError::InvalidValue { key: other, .. } if *other == key);
         if !self.context.problems.borrow().iter().any(is_reported) {
-            self.context.report(ConfigError::Missing { file: self.context.file.clone(), key, meaning });
+            let (file, meaning) = (self.context.file.clone(), meaning.into());
+            self.context.report(ConfigError::Missing { file, key, meaning });
         }
     }
 
@@ -313,16 +226,18 @@ impl<'a> Section<'a> {
         None
     }
 
-    fn take(&mut self, key: &'static str) -> Option<Value> {
+    /// Checks the name of the table, which is also used for frames and topics.
+    pub(super) fn check_name(&self, name: &str) {
+        let is_plain = |c: char| c.is_ascii_alphanumeric() || c == '_' || c == '-';
+        if name.is_empty() || !name.chars().all(is_plain) {
+            self.invalid::<()>("name", &Value::String(name.to_owned()), "letters, digits, _ and -");
+        }
+    }
+
+    /// Takes the value of a key, and marks the key as known.
+    pub(super) fn take(&mut self, key: &'static str) -> Option<Value> {
         self.known.push(key);
         self.context.accessed.borrow_mut().insert(join(&self.documented_path, key));
         self.table.remove(key)
     }
-}
-
-/// Converts integers and finite floats.
-fn as_number(value: &Value) -> Option<f64> {
-    #[expect(clippy::cast_precision_loss, reason = "numbers of a rig file stay far below 2^53")]
-    let number = value.as_float().or_else(|| value.as_integer().map(|whole| whole as f64))?;
-    number.is_finite().then_some(number)
 }

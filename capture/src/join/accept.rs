@@ -15,7 +15,7 @@ pub(super) struct Acceptance {
     spacing: Spacing,
     is_fixed: bool,
     readout_secs: f64,
-    /// All poses accepted so far, including those of evicted keyframes: otherwise a full store would accept the same
+    /// All poses accepted so far, including those of evicted keyframes. Otherwise, a full store would accept the same
     /// views again and again. Their number is bounded by the spacing and the space that the camera can reach.
     accepted: Vec<Transform>,
     last: Option<Stamp>,
@@ -23,7 +23,7 @@ pub(super) struct Acceptance {
 }
 
 impl Acceptance {
-    /// `is_fixed`: the camera never moves.
+    /// Creates the test for a camera. `is_fixed`: whether the camera never moves.
     pub(super) fn new(config: &JoinConfig, camera: &config::Camera, is_fixed: bool, spacing: Spacing) -> Self {
         Self {
             config: config.clone(),
@@ -85,8 +85,8 @@ impl Acceptance {
         if relative >= self.config.min_sharpness_frac { Ok(()) } else { Err(Rejection::NotSharp) }
     }
 
-    /// Adds the pose of a keyframe of the resumed run. Its stamp may be from another clock, so the interval of a fixed
-    /// camera starts again.
+    /// Adds the pose of a keyframe of the resumed run. Its stamp may come from another clock, so the interval of a
+    /// fixed camera starts again.
     pub(super) fn accept_resumed(&mut self, pose: &Transform) {
         self.accepted.push(*pose);
     }

@@ -17,7 +17,7 @@ pub(super) struct Undistorter {
 }
 
 impl Undistorter {
-    /// `scale`: factor for the width and height of the undistorted images.
+    /// Creates the maps of a camera. `scale`: factor for the width and height of the undistorted images.
     pub(super) fn new(intrinsics: &Intrinsics, scale: f64) -> crate::Result<Self> {
         let undistortion = (!intrinsics.is_pinhole()).then(|| Undistortion::new(intrinsics));
         let full = intrinsics.undistorted();
@@ -64,7 +64,7 @@ impl Undistorter {
     }
 }
 
-/// Decoded and undistorted depth of a camera. Readings outside the sensor's range become 0.
+/// Decodes and undistorts a depth image. Readings outside the sensor's range become 0.
 pub(super) fn depth_map(
     image: &Image,
     depth: &config::Depth,
@@ -96,10 +96,10 @@ pub(super) fn rgb(image: &Image, intrinsics: &Intrinsics) -> crate::Result<Vec<u
     Ok(image.decode_rgb()?)
 }
 
-/// Ground truth of a simulator for a keyframe, undistorted with the same maps.
+/// The simulator's ground truth for a keyframe, undistorted with the same maps as the image.
 pub(super) fn truth(truth: &TruthImage, intrinsics: &Intrinsics, undistorter: &Undistorter) -> crate::Result<Truth> {
     let rgba_srgb = undistorter.rgba(&rgb(&truth.image, intrinsics)?).context("the true image")?;
-    // The ceiling is for noise at full size; averaging areas removes much of the noise.
+    // The PSNR ceiling applies to noise at full size; averaging areas removes much of the noise.
     let psnr_ceiling = if undistorter.is_downscaled() { None } else { truth.psnr_ceiling };
     Ok(Truth { rgba_srgb, world_from_camera: truth.world_from_camera, psnr_ceiling })
 }

@@ -1,4 +1,4 @@
-//! Joins images, joint readings and calibration to keyframes.
+//! Joins images with joint readings, base poses and calibration, which gives keyframes.
 //!
 //! Samples are pushed one by one. The result depends only on their order, so a live lockstep run, its recording and the
 //! replay of that recording give bit-identical keyframes.
@@ -44,7 +44,7 @@ pub struct Join {
     store: KeyframeStore,
     ranges: RangeScans,
     list: Option<KeyframeList>,
-    /// The first image that was compared with the list.
+    /// The first image that was compared with the list, as an example for an error message.
     first_image: Option<(Arc<str>, Stamp)>,
     counts: Counts,
     /// Whether the warning about joint limits was logged.
@@ -53,14 +53,14 @@ pub struct Join {
     default_depth_m: f64,
     /// The latest stamp of all samples. The join uses no other clock.
     newest: Stamp,
-    /// The latest stamp of the keyframes of the resumed run.
+    /// The latest stamp of the keyframes from the resumed run.
     newest_resumed: Option<Stamp>,
     /// Nanoseconds added to the stamps of new keyframes so that they follow earlier ones; `None` before the first
     /// keyframe.
     stamp_offset_nanos: Option<i64>,
 }
 
-/// An event that follows from a sample.
+/// An event that pushing a sample causes.
 #[derive(Clone, Debug)]
 pub enum JoinEvent {
     /// A new keyframe was added to the store.
@@ -84,7 +84,7 @@ pub enum JoinEvent {
 /// A color image and its camera pose.
 #[derive(Clone, Debug)]
 pub struct PosedImage {
-    /// As delivered by the device; not undistorted.
+    /// The image as delivered by the device, not undistorted.
     pub image: Image,
     /// Pose of the camera at mid-exposure, without the correction of a station.
     pub world_from_camera: Transform,
@@ -148,10 +148,11 @@ impl Join {
         self
     }
 
-    /// Continues a run with these keyframes. Returns the camera and stamp of those that do not fit into the store.
+    /// Continues a run that already has these keyframes. Returns the camera and stamp of those that do not fit into the
+    /// store.
     ///
-    /// Clocks restart with a simulation or a computer. If the first new keyframe would not follow the earlier ones, all
-    /// new keyframes get a stamp offset.
+    /// Clocks restart when a simulation or the computer restarts. If the stamp of the first new keyframe is not later
+    /// than the earlier stamps, all new keyframes get a stamp offset.
     #[must_use]
     pub fn resume_from(mut self, keyframes: &[Arc<Keyframe>]) -> (Self, Vec<(Arc<str>, Stamp)>) {
         let mut evicted = Vec::new();
@@ -282,7 +283,7 @@ impl Join {
         }
     }
 
-    /// The oldest waiting image of a camera, once all its data have arrived. The error identifies an image that will
+    /// The oldest waiting image of a camera, if all its data have arrived. The error identifies an image that will
     /// never have a pose.
     fn next_ready(&mut self, camera_ix: usize, at_end: bool) -> Option<Result<ReadyImage, (Arc<str>, Stamp)>> {
         let camera = &mut self.cameras[camera_ix];
@@ -330,7 +331,7 @@ impl Join {
         self.first_image.get_or_insert_with(|| (Arc::clone(&name), stamp));
         let camera = &mut self.cameras[camera_ix];
         let split = match listed {
-            Some(None) => return, // Not listed, which is not a rejection.
+            Some(None) => return, // The image is not in the list; this does not count as a rejection.
             Some(Some(split)) => split,
             None => Split::of(camera.n_accepted),
         };
@@ -376,7 +377,7 @@ impl CameraState {
         if camera.stamp_to_mid_exposure.is_none() && camera.driver != CameraDriver::Sim {
             log::warn!("camera {:?}: stamp_to_mid_exposure_millis is not in the rig file; assuming 0", camera.name);
         }
-        // Depth keeps its size: it has its own intrinsics, and averages across depth edges would lie on no surface.
+        // Depth is not scaled: it has its own intrinsics, and averages across depth edges would not lie on any surface.
         let depth_undistorter =
             camera.depth.as_ref().map(|depth| Undistorter::new(&depth.intrinsics, 1.0)).transpose()?;
         Ok(Self {
@@ -390,7 +391,8 @@ impl CameraState {
         })
     }
 
-    /// The keyframe of an image, or the reason for rejecting it. `run_checks` is false if a list selects the keyframes.
+    /// Makes a keyframe from an image, or returns the reason for rejecting it. `run_checks` is false if a list selects
+    /// the keyframes.
     fn keyframe(
         &mut self,
         ready: ReadyImage,
@@ -441,7 +443,7 @@ impl CameraState {
         })
     }
 
-    /// If depth does not decode, the keyframe is kept without depth.
+    /// The depth of an image. If it does not decode, the keyframe is kept without depth.
     fn depth_of(&mut self, ready: &ReadyImage) -> Option<keyframe::DepthMap> {
         let (image, camera_pose) = ready.depth.as_ref()?;
         let map =

@@ -10,11 +10,12 @@ use nalgebra::Vector3;
 use std::sync::Arc;
 use std::time::Duration;
 
-/// Maximum number of readings kept: 20 s at 1 kHz, longer than any image waits.
+/// Maximum number of readings kept: those of 20 s at 1 kHz, longer than any image waits.
 const MAX_READINGS: usize = 20_000;
-/// Tolerance for joint positions beyond the limits, radians or meters: calibration errors and soft stops stay below.
+/// Tolerance for joint positions beyond the limits, radians or meters. Calibration errors and soft stops stay within
+/// it.
 const MAX_LIMIT_EXCESS: f64 = 0.2;
-/// Maximum gap for interpolating base poses from tags, in image periods: one image may lack a pose.
+/// Maximum gap for interpolating base poses from tags, in image periods. It lets one image in between lack a pose.
 const MAX_IMAGE_INTERVALS: f64 = 2.5;
 
 /// The recent motion of the robot.
@@ -132,12 +133,12 @@ impl Motion {
     /// Adds a ground truth base pose from a simulator.
     pub(super) fn push_base_truth(&mut self, truth: &BasePose) {
         if let BaseMotion::ReportedPoses(reported) = &mut self.base {
-            // Used in reports only, so an invalid pose is just left out.
+            // Ground truth is used only in reports, so an invalid pose is ignored.
             let _ = reported.truth.push(truth.stamp, truth.world_from_base);
         }
     }
 
-    /// The base pose at a stamp; `NotYet` if the poses do not reach that far.
+    /// The base pose at a stamp; `NotYet` if no pose at or after the stamp has arrived.
     pub(super) fn world_from_base(&self, stamp: Stamp) -> Result<Transform, HistoryError> {
         match &self.base {
             BaseMotion::Fixed(pose) => Ok(*pose),
@@ -145,7 +146,7 @@ impl Motion {
         }
     }
 
-    /// The pose and velocity of a camera at a stamp; `NotYet` if the readings do not reach that far.
+    /// The pose and velocity of a camera at a stamp; `NotYet` if no reading at or after the stamp has arrived.
     pub(crate) fn at(&self, camera: &config::Camera, stamp: Stamp) -> Result<CameraPose, HistoryError> {
         let (world_from_base, base_twist, base) = match &self.base {
             BaseMotion::Fixed(pose) => (*pose, Twist::zero(), None),
@@ -228,7 +229,7 @@ mod tests {
             lens: Lens::Pinhole,
             rectified: false,
         };
-        // From the design document: 0.1 m/s at 0.3 m shears a 720p image by 4.6 px in 15 ms.
+        // Motion of 0.1 m/s at a distance of 0.3 m shears a 720p image by 4.6 px in 15 ms.
         let sideways = Twist { linear_m_s: Vector3::new(0.1, 0.0, 0.0), angular_rad_s: Vector3::zeros() };
         assert!((image_speed_px_s(&sideways, &intrinsics, 0.3) * 0.015 - 4.6).abs() < 0.05);
 

@@ -5,9 +5,9 @@ use kinematics::quantile::{Rank, quantile};
 /// Approximate width of the reduced image. A common width makes sharpness comparable between cameras and averages out
 /// noise.
 const REDUCED_WIDTH: usize = 320;
-/// Sharpness is compared with the median of this many images, few enough that they show similar content.
+/// Number of images whose median sharpness is the reference. They are so few that they show similar content.
 const SHARPNESS_WINDOW: usize = 9;
-/// Brightness limits of 255: pixels at or beyond them are clipped.
+/// Brightness limits (0 to 255). Pixels at or beyond them count as clipped.
 const CLIPPED: [u8; 2] = [1, 254];
 
 /// Brightness and sharpness of one image.
@@ -17,7 +17,7 @@ pub(super) struct PixelStatistics {
     pub(super) luma_frac: f64,
     /// Fraction of pixels that are black or white.
     pub(super) clipped_frac: f64,
-    /// Variance of the Laplacian of the reduced image, relative to the variance of the image, so that contrast does not
+    /// Variance of the Laplacian of the reduced image divided by the variance of that image, so that contrast does not
     /// affect it. Only ratios between images of the same camera are meaningful.
     pub(super) sharpness: f64,
 }
@@ -118,7 +118,7 @@ fn luma([red, green, blue]: [u8; 3]) -> u32 {
 pub(super) struct SharpnessHistory(std::collections::VecDeque<f64>);
 
 impl SharpnessHistory {
-    /// Adds a value; returns it relative to the median of the latest images, including this one.
+    /// Adds a value and returns its ratio to the median of the latest images, including this one.
     pub(super) fn relative(&mut self, sharpness: f64) -> f64 {
         if self.0.len() == SHARPNESS_WINDOW {
             self.0.pop_front();

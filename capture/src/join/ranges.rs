@@ -14,7 +14,8 @@ const MAX_WAITING: usize = 64;
 
 /// Side of a depth cell in pixels. The rings of a scanner are about ten pixels apart.
 const CELL_PX: u32 = 8;
-/// Maximum time between an image and the scans used for its depth: scans from farther away have other occlusions.
+/// Maximum time between an image and the scans used for its depth. Older and newer scans were taken from elsewhere,
+/// with other occlusions.
 const MAX_TIME_DIFFERENCE_SECS: f64 = 1.0;
 /// Minimum number of filled cells for a depth map.
 const MIN_CELLS: usize = 16;
@@ -46,8 +47,8 @@ impl RangeScans {
 
     /// Depth of a keyframe from the scans around its stamp; `None` if they cover too little of the image.
     ///
-    /// A cell of [`CELL_PX`] pixels per side takes its nearest point, because points on farther surfaces also project
-    /// between the rings.
+    /// A cell of [`CELL_PX`] pixels per side takes its nearest point, because points on more distant surfaces also
+    /// project into the gaps between the rings.
     pub(super) fn depth_of(&self, keyframe: &Keyframe) -> Option<DepthMap> {
         let size_px = keyframe.size_px.map(|side| side.div_ceil(CELL_PX));
         let per_cell = f64::from(CELL_PX);
@@ -84,7 +85,7 @@ impl RangeScans {
         })
     }
 
-    /// Queues a scan; returns false if this scan or an older one is dropped.
+    /// Queues a scan. Returns false if this scan or an older scan is dropped.
     pub(super) fn push(&mut self, scan: RangeScan) -> bool {
         let is_known_scanner = self.scanners.iter().any(|scanner| scanner.name == scan.scanner);
         if !is_known_scanner {

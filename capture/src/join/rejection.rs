@@ -4,7 +4,7 @@ use keyframe::counted;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
-/// Why an image did not become a keyframe.
+/// The reason why an image did not become a keyframe.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Rejection {
     /// The rig file has no camera of this name.
@@ -17,7 +17,7 @@ pub enum Rejection {
     PoseNotFinite,
     /// The camera has not moved enough since its nearest keyframe.
     NotMoved,
-    /// The predicted motion blur is too long.
+    /// The predicted motion blur is too large.
     Blur,
     /// The predicted rolling-shutter shear is too large.
     Shear,
@@ -69,7 +69,7 @@ impl std::fmt::Display for Rejection {
     }
 }
 
-/// Counts of all samples; printed as one line that lists the counts above 0.
+/// Counts of all samples. They are printed as one line that lists the counts above 0.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Counts {
     /// Color images received.
@@ -82,13 +82,13 @@ pub struct Counts {
     pub without_depth: u64,
     /// Images dropped by devices or queues before the join.
     pub device_skipped: u64,
-    /// Joint readings that were out of order, not finite, or of another arm.
+    /// Joint readings that were out of order or not finite, or had the wrong number of joints.
     pub joints_rejected: u64,
     /// Base poses that were out of order or not finite.
     pub base_poses_rejected: u64,
     /// Range scans transformed to the world frame.
     pub range_scans: u64,
-    /// Range scans without base poses, of unknown scanners, or dropped because too many were waiting.
+    /// Range scans that had no base poses, came from unknown scanners, or were dropped because too many were waiting.
     pub range_scans_rejected: u64,
     /// Images rejected, by reason.
     pub rejected: BTreeMap<Rejection, u64>,
@@ -101,8 +101,8 @@ pub struct Counts {
 pub enum SampleUse {
     /// The samples are recorded: every image counts.
     Recorded,
-    /// The samples are only processed. A live image that comes too fast is replaced by the next; in a replay, drops by
-    /// devices were reported when the recording was made.
+    /// The samples are only processed. Dropped live images do not count, because the next image replaces them. In a
+    /// replay, drops by devices were already reported when the recording was made.
     ProcessedOnly,
 }
 

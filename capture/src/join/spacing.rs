@@ -10,7 +10,7 @@ pub(super) struct Spacing {
 }
 
 impl Spacing {
-    /// The larger of translation and rotation, each divided by its unit; keyframes need at least 1.
+    /// The larger of translation and rotation, each divided by its unit. A new keyframe needs at least 1.
     pub(super) fn between(&self, a: &Transform, b: &Transform) -> f64 {
         let translation_m = (a.translation.vector - b.translation.vector).norm();
         (translation_m / self.translation_m).max(a.rotation.angle_to(&b.rotation) / self.rotation_rad)

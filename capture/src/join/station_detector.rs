@@ -1,12 +1,12 @@
-//! Detects stations of the base from its reported poses. Only past poses are used, so nothing has to wait for later
-//! ones.
+//! Detects stations of the base from its reported poses. Only past poses are used, so images do not have to wait for
+//! later poses.
 
 use kinematics::{Stamp, Transform};
 use std::collections::VecDeque;
 
-/// The base is stationary once it has stayed this long ...
+/// Time for which the base must stay near one pose to count as stationary.
 const STATIONARY_SECS: f64 = 0.5;
-/// ... within this distance of one pose, meters and radians.
+/// Maximum distance from that pose, meters and (next constant) radians.
 const STATIONARY_M: f64 = 0.005;
 const STATIONARY_RAD: f64 = 0.005;
 /// Maximum number of stations kept, far more than any image waits for.
@@ -15,7 +15,7 @@ const MAX_STATIONS: usize = 64;
 /// The stations of a moving base, counted from 0.
 #[derive(Debug, Default)]
 pub(super) struct StationDetector {
-    /// Pose near which the base is, and the stamp since when.
+    /// Pose near which the base currently is, and the stamp since which it has been there.
     stationary_since: Option<(Stamp, Transform)>,
     /// Whether the newest station is at that pose.
     is_known: bool,
@@ -51,7 +51,7 @@ impl StationDetector {
         }
     }
 
-    /// The station at a stamp no later than the newest pose; `None` while the base moves or has just stopped.
+    /// The station at a stamp that is not later than the newest pose; `None` while the base moves or has just stopped.
     pub(super) fn at(&self, stamp: Stamp) -> Option<usize> {
         let span = self.stations.iter().rev().find(|span| span.from <= stamp)?;
         (stamp <= span.to).then_some(span.station)

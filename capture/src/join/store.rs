@@ -9,7 +9,7 @@ use keyframe::{Keyframe, Split};
 use kinematics::Stamp;
 use std::sync::Arc;
 
-/// Shares of the splits: every 8th keyframe is for testing, every 8th for validation.
+/// Shares of the splits: of eight keyframes, one is for testing and one for validation.
 const SHARES: [(Split, f64); 3] = [(Split::Train, 6.0), (Split::Validation, 1.0), (Split::Test, 1.0)];
 
 /// Keyframes in order of acceptance.

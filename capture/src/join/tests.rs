@@ -217,7 +217,8 @@ fn ground_truth_and_depth_are_matched_in_any_order() {
             && truth.world_from_camera.translation.z == keyframe.stamp.secs()
             && truth.psnr_ceiling == Some(42.0)
     }));
-    // Depth before color, with the truth between or before them; and all images 0.3 s before their readings.
+    // In one order, depth comes before color, with ground truth between or before them. In the other, all images come
+    // 0.3 s before their readings.
     let is_color = |sample: &Sample| matches!(sample, Sample::Image(image) if !image.is_depth());
     let mut shuffled = in_order.clone();
     let colors: Vec<usize> = (0..shuffled.len()).filter(|ix| is_color(&shuffled[*ix])).collect();

@@ -20,14 +20,14 @@ pub(super) struct Waiting {
     expects_truth: bool,
 }
 
-/// A matching image that may exist.
+/// State of the matching depth image or ground truth of a color image.
 #[derive(Clone, Copy, Debug)]
 pub(super) enum Partner<T> {
-    /// It has arrived.
+    /// The image has arrived.
     Available(T),
-    /// It may still come.
+    /// The image may still arrive.
     NotYet,
-    /// It will never come.
+    /// The image will never arrive.
     Never,
 }
 
@@ -36,7 +36,7 @@ impl Waiting {
         Self { color: VecDeque::new(), depth: VecDeque::new(), truth: VecDeque::new(), expects_truth }
     }
 
-    /// Queues a color image; returns the oldest if too many wait.
+    /// Queues a color image. If too many wait, removes and returns the oldest.
     pub(super) fn push_color(&mut self, image: Image) -> Option<Image> {
         let dropped_image = if self.color.len() == MAX_WAITING { self.color.pop_front() } else { None };
         self.color.push_back(image);
@@ -61,11 +61,11 @@ impl Waiting {
         self.color.pop_front()
     }
 
-    /// Mid-exposure of the depth image nearest to a stamp, at most `max_difference_secs` away, and whether this is
-    /// final.
+    /// Mid-exposure of the depth image nearest to a stamp, at most `max_difference_secs` away, and whether no nearer
+    /// image can follow.
     pub(super) fn depth_near(&self, stamp: Stamp, max_difference_secs: f64) -> (Option<Stamp>, bool) {
         let nearest = self.depth.iter().map(|(at, _)| *at).min_by_key(|at| at.nanos_since(stamp).unsigned_abs());
-        // Depth comes in order, so after an image at or past the stamp no nearer one follows.
+        // Depth images arrive in order, so no nearer one follows an image at or after the stamp.
         let is_final = self.depth.back().is_some_and(|(newest, _)| *newest >= stamp);
         (nearest.filter(|at| at.secs_since(stamp).abs() <= max_difference_secs), is_final)
     }
@@ -84,7 +84,7 @@ impl Waiting {
         }
     }
 
-    /// Stops expecting ground truth, because it did not come in time.
+    /// Stops expecting ground truth, because it did not arrive in time.
     pub(super) fn stop_waiting_for_truth(&mut self) {
         self.expects_truth = false;
     }

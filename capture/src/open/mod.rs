@@ -14,15 +14,16 @@ pub use real::{check_motion, movable_arm, udp_arm_address};
 
 use crate::config::{ArmDriver, BaseDriver, CameraDriver, Override, Parent, Rig, ScannerDriver};
 use crate::error::{Context, Error};
+use crate::stamp_clock::StampClock;
 use drivers::recording::{RIG_FILE, Recorder, Recording, RecordingMetadata, URDF_FILE};
-use drivers::{Live, Sample, Source};
+use drivers::{Live, Playback, Sample, Source};
 use keyframe::bail;
 use kinematics::Chain;
 use std::path::Path;
 use std::sync::{Arc, OnceLock};
 use tags::TagBaseSource;
 
-/// Hint for missing devices.
+/// Hint in error messages about devices that cannot be opened.
 const SIM_HINT: &str = "--sim replaces every device by its simulated twin";
 
 /// The port of a Franka controller.
@@ -43,8 +44,19 @@ pub struct Opened {
     pub rig: Rig,
     /// The samples of all devices, or of the recording.
     pub source: Box<dyn Source>,
-    /// Set when the samples end early because the recording is damaged.
+    /// Description of the damage, set if the samples end early because the recording is damaged.
     pub damage: Arc<OnceLock<String>>,
+    /// The clock of the stamps.
+    pub stamp_clock: StampClock,
+}
+
+impl Opened {
+    /// Plays a recording at the speed of its devices. If the caller is too slow, images are dropped.
+    #[must_use]
+    pub fn in_real_time(self) -> Self {
+        let playback = Playback::new(self.source);
+        Self { stamp_clock: StampClock::Playback(playback.clock()), source: Box::new(playback), ..self }
+    }
 }
 
 /// Opens the devices of a rig. Calibration that the rig file omits is read from the cameras that store it.
@@ -81,7 +93,7 @@ pub fn rig(mut rig: Rig, devices: Devices) -> crate::Result<Opened> {
         BaseDriver::Tags => Box::new(TagBaseSource::new(&rig, source)?),
         _ => source,
     };
-    Ok(Opened { rig, source, damage: Arc::default() })
+    Ok(Opened { rig, source, damage: Arc::default(), stamp_clock: StampClock::Computer })
 }
 
 /// Opens a recording with the rig stored in it, or with the given one. The joint order is the one stored in the
@@ -110,7 +122,7 @@ pub fn recording(path: &Path, rig: Option<Rig>, overrides: &[Override]) -> crate
     check_intrinsics(&rig)?;
     let damage = Arc::default();
     let source = Box::new(RecordingSource { recording, damage: Arc::clone(&damage) });
-    Ok(Opened { rig, source, damage })
+    Ok(Opened { rig, source, damage, stamp_clock: StampClock::Unrelated })
 }
 
 /// Creates a recording of a rig, with the rig file and the URDF attached.
@@ -147,7 +159,7 @@ fn stored_rig(path: &Path, recording: &Recording, overrides: &[Override]) -> cra
     Ok(Rig::parse(RIG_FILE, text(RIG_FILE)?, text(URDF_FILE)?, overrides)?)
 }
 
-/// Cameras on the flange need joint readings.
+/// Checks that the rig has an arm if a camera is on the flange.
 fn check_arm(rig: &Rig) -> crate::Result<()> {
     let on_flange = rig.cameras.iter().find(|camera| camera.parent == Parent::Flange);
     if let (ArmDriver::None, Some(camera)) = (rig.arm.driver, on_flange) {
@@ -159,7 +171,8 @@ fn check_arm(rig: &Rig) -> crate::Result<()> {
     Ok(())
 }
 
-/// Intrinsics that are stored in the camera are unknown unless the camera is opened.
+/// Checks that all intrinsics are known. Intrinsics that are stored in the camera are unknown unless the camera is
+/// opened.
 fn check_intrinsics(rig: &Rig) -> crate::Result<()> {
     if let Some(camera) = rig.cameras.iter().find(|camera| camera.realsense.unknown.intrinsics) {
         bail!(
@@ -217,7 +230,7 @@ impl Source for RecordingSource {
         if sample.is_none()
             && let Some(damage) = self.recording.damage()
         {
-            // Reported once, at the end, with the other losses.
+            // The damage is reported once, at the end, with the other losses.
             let _ = self.damage.set(damage.to_owned());
         }
         Ok(sample)

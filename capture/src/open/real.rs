@@ -5,6 +5,8 @@ use crate::config::Depth;
 use crate::config::{ArmDriver, ArmMotion, BaseDriver, Camera, CameraDriver, Rig, ScannerDriver};
 use crate::error::Context;
 #[cfg(target_os = "linux")]
+use drivers::can::odrive::Endpoints;
+#[cfg(target_os = "linux")]
 use drivers::can::{self, CanArm, MovableArmConfig, MovableCanArm};
 #[cfg(target_os = "linux")]
 use drivers::franka::{self, FrankaArm, MovableFrankaArm};
@@ -14,8 +16,6 @@ use drivers::motion::{MotionConfig, MotionLimits};
 use drivers::udp::{UdpArm, UdpBase, UdpScanner};
 #[cfg(target_os = "linux")]
 use drivers::v4l2::{Config, Settings, V4l2Camera, V4l2Format};
-#[cfg(target_os = "linux")]
-use drivers::wire::can::odrive::Endpoints;
 use drivers::{Arm, Base, Devices, RangeScanner};
 use keyframe::bail;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
@@ -54,7 +54,7 @@ pub(super) fn open(rig: &mut Rig) -> crate::Result<Devices> {
     Ok(devices)
 }
 
-/// Opens the arm for motion: enables it and holds its position. Joint positions are those of the device, without
+/// Opens the arm for motion: enables it and holds its position. Positions of the returned arm do not include
 /// `arm.joint_offsets`.
 ///
 /// # Errors
@@ -191,7 +191,7 @@ pub fn franka_chain(rig: &Rig) -> crate::Result<kinematics::Chain> {
     let Rig { arm, .. } = rig;
     let robot = kinematics::urdf::Robot::parse(&arm.urdf_text).context("the arm's URDF")?;
     let path = robot.path(&arm.base_link, &arm.flange_link).context("the arm's URDF")?;
-    // That link is the parent of the arm's first joint, wherever it is on the base.
+    // Franka reports poses in the parent link of the arm's first joint, wherever that link is on the base.
     let first = path.iter().find(|joint| arm.joints.contains(&joint.name));
     let arm_base_link = first.map_or(&arm.base_link, |joint| &joint.parent);
     kinematics::Chain::new(&robot, arm_base_link, &arm.flange_link).context("the arm's URDF")
@@ -223,7 +223,7 @@ pub fn udp_arm_address(rig: &Rig) -> crate::Result<SocketAddr> {
     }
 }
 
-/// Opens a V4L2 camera: its color images, and its depth images if it has depth.
+/// Opens the color images of a V4L2 camera, and its depth images if the rig file configures depth.
 #[cfg(target_os = "linux")]
 fn v4l2_cameras(camera: &Camera) -> crate::Result<Vec<Box<dyn drivers::Camera>>> {
     let depth = camera.depth.as_ref().map(|depth| v4l2_depth(camera, depth)).transpose()?;

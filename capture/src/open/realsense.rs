@@ -21,10 +21,10 @@ mod with_sdk {
     use std::time::Duration;
 
     /// Maximum difference between the intrinsics in the rig file and those stored in the camera, pixels. Above it, one
-    /// of them is probably of another camera.
+    /// of them probably belongs to another camera.
     const MAX_DIFFERENCE_PX: f64 = 5.0;
 
-    /// Opens a camera and takes calibration from it that the rig file omits. Values in the rig file take precedence.
+    /// Opens a camera and copies calibration that the rig file omits from it. Values in the rig file take precedence.
     pub(in crate::open) fn open(camera: &mut Camera) -> crate::Result<Box<dyn drivers::Camera>> {
         let open = RealsenseCamera::open(config(camera))?;
         let known = open.calibration();

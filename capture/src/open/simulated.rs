@@ -95,7 +95,11 @@ fn config_of(rig: &Rig) -> crate::Result<sim::Config> {
         joint_names: super::chain_of(rig)?.joint_names().to_vec(),
         reading_order: rig.arm.joints.clone(),
         scanners: rig.scanners.iter().filter(|scanner| scanner.driver == ScannerDriver::Sim).map(scanner_of).collect(),
-        base: sim::BaseConfig { rate_hz: rig.base.rate_hz, drift_m: rig.base.drift_m, drift_rad: rig.base.drift_rad },
+        base: sim::BaseConfig {
+            rate_hz: rig.base.rate_hz,
+            drift_m: rig.base.sim.drift_m,
+            drift_rad: rig.base.sim.drift_rad,
+        },
         light_inside_frac: rig.sim.light_inside_frac,
         cameras: rig.cameras.iter().filter(|camera| camera.driver == CameraDriver::Sim).map(camera_of).collect(),
     })

@@ -11,7 +11,7 @@ use kinematics::{HistoryError, Stamp, Transform, Twist};
 use nalgebra::{Matrix6, Vector3, Vector6};
 use std::collections::{BTreeMap, VecDeque};
 
-/// Maximum number of detections that wait for joint states. More mean that the arm sends nothing, which is reported
+/// Maximum number of detections that wait for joint states. If there are more, the arm sends nothing, which is reported
 /// elsewhere.
 const MAX_WAITING: usize = 64;
 /// After this many images in which no pose fits the tags, one of the tags is probably not where the rig file places it.
@@ -27,7 +27,7 @@ pub(super) struct TagBaseSource {
     is_lockstep: bool,
     cameras: Vec<Camera>,
     tags: BTreeMap<u32, TagPlacement>,
-    /// The arm alone, on a base at the world origin.
+    /// Motion of the arm alone, as if its base were at the world origin.
     arm: Motion,
     pending: VecDeque<TagDetections>,
     ready: VecDeque<Sample>,
@@ -238,7 +238,7 @@ impl Drop for TagBaseSource {
     }
 }
 
-/// The covariance of the base pose in base axes, computed from that of a camera on it.
+/// The covariance of the base pose in base axes, computed from the covariance of the pose of a camera on the base.
 fn of_base(of_camera: &Matrix6<f64>, base_from_camera: &Transform) -> Matrix6<f64> {
     let camera_from_base = base_from_camera.inverse();
     let columns: [Vector6<f64>; 6] = std::array::from_fn(|ix| {

@@ -1,4 +1,4 @@
-//! Nearest of the squares that cover each pixel of an image.
+//! For each pixel of an image, finds the nearest of the squares that cover it.
 //!
 //! Neighboring pixels in a row of depth usually cover the same lines of the color image. For such a run, only the
 //! columns are computed pixel by pixel, in one strip per square width. The result is then written to all lines of the
@@ -8,14 +8,14 @@ use std::ops::Range;
 
 /// Value of a pixel that no square covers: larger than any count minus one.
 pub(super) const NO_DEPTH: u16 = u16::MAX;
-/// Squares one to four columns wide each have a strip. Wider ones are rare and are written column by column.
+/// Maximum square width, in columns, with its own strip. Wider squares are rare and are written column by column.
 const MAX_STRIPS: usize = 4;
 /// Padding before the first column of a strip.
 const PAD: usize = MAX_STRIPS;
 /// Number of cells of all strips. Every 16-bit index is valid, so no access needs a bounds check.
 const N_STRIP_CELLS: usize = 1 << 16;
-/// Cells behind the strips for pixels without depth, used in rotation: with a single cell, each write would have to
-/// wait for the one before.
+/// Number of cells behind the strips for pixels without depth. They are used in rotation, because with a single cell,
+/// each write would have to wait for the previous one.
 const N_DISCARD_CELLS: usize = 256;
 /// Marks a square that is too wide for the strips.
 const WIDE: u16 = u16::MAX;
@@ -25,7 +25,7 @@ pub(super) const MAX_COLUMNS: usize = N_STRIP_CELLS - 1 - N_DISCARD_CELLS - PAD 
 const BLOCK: usize = 32;
 
 /// First and last column and row that each pixel of one row of depth covers, clipped to the image. Indices start at 1;
-/// 0 is before the image. If a first index is greater than the last, the pixel covers nothing.
+/// 0 is before the image. If a first index is greater than the corresponding last index, the pixel covers nothing.
 pub(super) struct PixelBounds {
     pub(super) first: [Vec<u16>; 2],
     pub(super) last: [Vec<u16>; 2],
@@ -36,8 +36,8 @@ pub(super) struct NearestDepth {
     width: usize,
     /// Nearest count minus one of each pixel: `[height, width]`.
     nearest: Vec<u16>,
-    /// Minimum over the squares of the current run that start at each column, one strip per square width: `n_strips`
-    /// strips of `stride` cells, then [`N_DISCARD_CELLS`].
+    /// For each column, the minimum over the squares of the current run that start there. There is one strip per square
+    /// width: `n_strips` strips of `stride` cells, then [`N_DISCARD_CELLS`].
     strips: Box<[u16; N_STRIP_CELLS]>,
     /// Number of strips that fit.
     n_strips: usize,
@@ -52,7 +52,7 @@ pub(super) struct NearestDepth {
 }
 
 impl NearestDepth {
-    /// An empty image for rows of `depth_width` depth pixels.
+    /// Creates an empty image into which rows of `depth_width` depth pixels are drawn.
     pub(super) fn new([width, height]: [usize; 2], depth_width: usize) -> Self {
         let stride = width.min(MAX_COLUMNS) + 1 + PAD;
         Self {
@@ -166,7 +166,7 @@ impl NearestDepth {
     }
 }
 
-/// Index of the first number that fulfills the predicate. Tests whole blocks so that the compiler can vectorize.
+/// Index of the first number that fulfills the predicate. Whole blocks are tested so that the compiler can vectorize.
 #[inline(always)]
 fn find_blockwise(numbers: &[u32], predicate: impl Fn(u32) -> bool) -> Option<usize> {
     let has_one = |block: &&[u32]| block.iter().fold(false, |any, number| any | predicate(*number));

@@ -2,9 +2,9 @@
 //!
 //! Source: the processing block `align` of librealsense (`src/proc/align.cpp`). A depth pixel is a square. Two opposite
 //! corners are projected to the color image at the depth of the pixel, and each color pixel keeps the nearest square
-//! that covers it. We clip squares at the edge of the image, whereas librealsense drops them. Its SSE path
-//! (`src/proc/sse/sse-align.cpp`) rounds half a pixel further to the right and down, and uses only the upper left
-//! corner if color has fewer pixels per angle than depth; we follow the scalar path.
+//! that covers it. We clip squares at the edge of the image, whereas librealsense drops them. The SSE path of
+//! librealsense (`src/proc/sse/sse-align.cpp`) rounds half a pixel further to the right and down, and uses only the
+//! upper left corner if color has fewer pixels per angle than depth. We follow its scalar path.
 
 mod cover;
 
@@ -47,9 +47,9 @@ enum ColorLens {
 /// A corner of the pixels of one row of depth.
 #[derive(Clone, Copy)]
 enum Corner {
-    /// Upper left. Hidden corners are set to a position after the image.
+    /// Upper left corner. Hidden corners get a position after the image.
     First,
-    /// Lower right. Hidden corners are set to a position before the image.
+    /// Lower right corner. Hidden corners get a position before the image.
     Last,
 }
 
@@ -67,7 +67,7 @@ struct View {
 struct Row {
     /// Depth along z.
     counts: Vec<u16>,
-    /// The same as floats.
+    /// The counts as floats.
     numbers: Vec<f32>,
     /// Columns and rows in the color image, pixels.
     positions_px: [Vec<f32>; 2],
@@ -118,11 +118,11 @@ impl DepthAlignment {
         }
     }
 
-    /// Returns the depth image in the pixels of the color image. Counts keep their unit and are along the z axis of the
-    /// depth camera; 0 means no depth. Readings of 0 and of the largest count are invalid and are skipped.
+    /// Resamples the depth image to the pixels of the color image. Counts keep their unit and are along the z axis of
+    /// the depth camera; 0 means no depth. Readings of 0 and of the largest count are invalid and are skipped.
     ///
     /// # Errors
-    /// If the image holds no depth or its size is not that of the depth camera.
+    /// If the image contains no depth or its size differs from that of the depth camera.
     pub fn align(&self, depth: &Image) -> Result<Image, Error> {
         let PixelFormat::DepthU16 { meters_per_count } = depth.format else {
             return Err(depth.wrong_kind("depth"));
@@ -153,7 +153,7 @@ impl DepthAlignment {
             positions_px: [vec![0.0; depth_width], vec![0.0; depth_width]],
             bounds: PixelBounds { first: pixel_bounds(), last: pixel_bounds() },
         };
-        // In units of one count, so that counts need no scaling.
+        // The position is in units of one count, so that counts need no scaling.
         let depth_in_color = self.depth_in_color.map(|meters| narrow(meters / meters_per_count));
         for (row_ix, row) in counts.chunks_exact(depth_width.max(1)).enumerate() {
             work.counts.iter_mut().zip(row).for_each(|(count, bytes)| *count = u16::from_le_bytes(*bytes));

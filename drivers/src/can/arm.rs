@@ -1,9 +1,10 @@
-//! An arm whose joints are motors on CAN buses. One thread per bus polls and listens; the caller gets states of all
-//! joints.
+//! Reads an arm whose joints are motors on CAN buses. One thread per bus polls and listens; the caller receives states
+//! of all joints.
 
-use super::bus::{Bus, BusEvent, WireErrors};
+use super::bus::Bus;
 use super::bus_load::max_cycle_rate_hz;
 use super::config::{ArmConfig, BusConfig};
+use super::frame_io::{BusEvent, WireErrors};
 use super::joints::{JointReading, Joints};
 use super::motor::Motor;
 use crate::wire::can::{Frame, canopen};
@@ -19,12 +20,12 @@ use std::time::{Duration, Instant};
 const POLL: Duration = Duration::from_millis(50);
 /// Capacity of the queue of readings for a slow caller: one second of seven motors at 1 kHz.
 pub(super) const MAX_WAITING: usize = 7000;
-/// A longer loop iteration of a bus thread means that the thread was not scheduled.
+/// If a loop iteration of a bus thread takes longer than this, the thread was not scheduled.
 const MAX_LOOP_DELAY: Duration = Duration::from_millis(200);
-/// A motor that sends nothing for this long while the others do is an error.
+/// A motor that sends nothing for this long causes an error.
 const MAX_SILENCE: Duration = Duration::from_secs(1);
 
-/// A read-only arm. Nothing here moves it. Dropping it stops the polling and does not change what the motors do.
+/// A read-only arm, which cannot be moved. Dropping it stops the polling but does not affect the motors otherwise.
 #[derive(Debug)]
 pub struct CanArm {
     names: Vec<String>,
@@ -109,20 +110,20 @@ struct Cycle {
 impl Cycle {
     /// Polls at the requested rate, or at the highest rate that keeps the bus load within bounds.
     fn new(bus: &BusConfig, motors: &[(usize, Motor)], rate_hz: f64) -> Self {
-        let mut poll_frames: Vec<_> = motors.iter().filter_map(|(_, motor)| motor.poll_frame()).collect();
-        if motors.iter().any(|(_, motor)| motor.needs_sync()) {
+        let mut poll_frames: Vec<_> = motors.iter().filter_map(|(_, motor)| motor.protocol().poll_frame()).collect();
+        if motors.iter().any(|(_, motor)| motor.protocol().canopen_node().is_some()) {
             poll_frames.push(canopen::encode_sync());
         }
         let mut cycle_frames = poll_frames.clone();
         let mut unsolicited = Vec::new();
-        for (answer, own_rate_hz) in motors.iter().map(|(_, motor)| motor.typical_answer()) {
+        for (answer, own_rate_hz) in motors.iter().map(|(_, motor)| motor.protocol().typical_answer()) {
             match own_rate_hz {
                 Some(own_rate_hz) => unsolicited.push((answer, own_rate_hz)),
                 None => cycle_frames.push(answer),
             }
         }
         let poll_rate_hz = match poll_frames.is_empty() {
-            // There are no polls; the motors choose their own rates.
+            // Nothing is polled; the motors choose their own rates.
             true => rate_hz,
             false => max_cycle_rate_hz(bus, &cycle_frames, &unsolicited, rate_hz),
         };
@@ -130,7 +131,7 @@ impl Cycle {
     }
 }
 
-/// A bus with its motors, moved to the thread of the bus.
+/// A bus with its motors, owned by the thread of the bus.
 struct BusReader {
     bus: Bus,
     motors: Vec<(usize, Motor)>,
@@ -158,7 +159,8 @@ impl BusReader {
             let now = clock::now();
             let stall = now.duration_since(std::mem::replace(&mut previous, now));
             if stall > MAX_LOOP_DELAY {
-                // Nobody listened while this computer was stalled, so that time does not count as silence of a motor.
+                // While this computer was stalled, no frames were read, so this time does not count as silence of a
+                // motor.
                 last_heard.iter_mut().for_each(|last_heard| *last_heard = last_heard.plus_secs(stall.as_secs_f64()));
             }
             if !self.cycle.poll_frames.is_empty() && now >= next_cycle {
@@ -216,8 +218,8 @@ impl BusReader {
         Err(Error::Motor { joint: motor.config().joint.clone(), interface, reason })
     }
 
-    /// Logs errors on the wire: each time the controller goes off the bus or restarts, and otherwise each time the
-    /// count has doubled.
+    /// Logs errors on the wire each time the controller goes bus-off or restarts, and otherwise each time their number
+    /// has doubled.
     fn log_errors(&self, total: &mut WireErrors, new_errors: &WireErrors) {
         let previous = total.n_frames.checked_ilog2();
         total.add(new_errors);
@@ -229,7 +231,8 @@ impl BusReader {
 
 #[cfg(test)]
 mod tests {
-    use super::super::config::{Family, MotorConfig};
+    use super::super::config::MotorConfig;
+    use super::super::damiao::Damiao;
     use super::*;
 
     #[test]
@@ -242,12 +245,12 @@ mod tests {
         };
         let motors: Vec<_> = (0..7)
             .map(|ix| {
-                let family = Family::Damiao { motor: ix + 1, feedback: 0x10 + ix };
+                let protocol = Arc::new(Damiao { motor: ix + 1, feedback: 0x10 + ix });
                 let joint = format!("joint{ix}");
                 let config = MotorConfig {
                     joint,
                     bus_ix: 0,
-                    family,
+                    protocol,
                     gear_ratio: 1.0,
                     is_reversed: false,
                     offset_rad: 0.0,

@@ -2,15 +2,17 @@
 //! fault.
 //!
 //! It stops if a motor is silent or reports that it stopped, if a bus fails, or if this computer stalls for so long
-//! that the watchdogs of the motors have expired or are about to. After that it sends none of the earlier setpoints,
-//! and no new ones until it receives [`Request::Recover`].
+//! that the watchdogs of the motors have expired or are about to. After that, it discards earlier setpoints and sends
+//! no new ones until it receives [`Request::Recover`].
 
-use super::bus::{Bus, BusEvent, WireErrors};
-use super::bus_load::max_cycle_rate_hz;
-use super::config::{Family, MovableArmConfig};
+use super::bus::Bus;
+use super::config::MovableArmConfig;
+use super::family::Health;
+use super::frame_io::{BusEvent, WireErrors};
 use super::joints::JointReading;
 use super::motor::Reading;
-use super::movable_motor::{Health, MovableMotor};
+use super::movable_motor::MovableMotor;
+use super::plan::watchdog_plan;
 use super::watchdog::WatchdogPlan;
 use crate::motion::{JointTarget, Motion, MotionLimits, OnLoss, TrajectoryGenerator};
 use crate::wire::can::Frame;
@@ -23,23 +25,22 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender};
 use std::time::Duration;
 
-/// Fraction of the motors' timeout after which we stop. We stop before the motors do, so that no motor is commanded
-/// while others have already stopped.
+/// Fraction of the watchdog timeout after which this thread stops the arm. It stops before the motors do, so that no
+/// motor is commanded while others have already stopped.
 const SILENCE_FRAC: f64 = 0.8;
-/// Minimum length of the timeout in cycles.
-const MIN_CYCLES: u32 = 4;
-/// A motor counts as silent only after this many cycles: if we were late ourselves, its answer is still to come.
+/// A motor counts as silent only after this many cycles. If this thread was late, the answer of the motor may still
+/// arrive.
 const MIN_MISSED_CYCLES: u64 = 3;
 /// Maximum time for the motors to report their positions, and to report that they are enabled.
 const STARTUP_TIMEOUT: Duration = Duration::from_secs(2);
-/// Time in which an interface's queue of ten frames, the usual length, is half emptied.
+/// Time in which an interface sends half of its queue, which usually holds ten frames.
 const MAX_QUEUED: Duration = Duration::from_micros(800);
 /// Maximum wait for space in the queue when sending a fail-safe command. If the queue stays full, nobody is
 /// receiving.
 const MAX_FAIL_SAFE_WAIT: Duration = Duration::from_millis(5);
 /// Interval at which an idle thread checks for requests.
 const POLL: Duration = Duration::from_millis(20);
-/// Extra time, beyond what its limits require, in which an arm must come to rest on shutdown.
+/// Additional time, beyond the time that its limits require, in which an arm must come to rest on shutdown.
 const STOP_MARGIN: Duration = Duration::from_secs(1);
 
 type Reply<T> = SyncSender<Result<T, Error>>;
@@ -74,7 +75,7 @@ struct PreparedMotors {
     buses: Vec<Bus>,
     /// One motor per joint.
     movable_motors: Vec<MovableMotor>,
-    /// When each motor was last heard, and in which cycle.
+    /// Time and cycle of the last frame from each motor.
     last_heard: Vec<(Stamp, u64)>,
     latest: Vec<Option<Reading>>,
     /// Last commanded position of each joint.
@@ -113,7 +114,7 @@ impl ArmLoop {
         motion: Arc<Mutex<Motion>>,
         is_shutting_down: Arc<AtomicBool>,
     ) -> Result<Self, Error> {
-        let plan = WatchdogPlan::new(config)?;
+        let plan = watchdog_plan(config)?;
         let arm_state = ArmState::stopped(clock::now(), None);
         Ok(Self {
             config: config.clone(),
@@ -179,7 +180,7 @@ impl ArmLoop {
                 let _ = answer.try_send(Ok(()));
             }
             (Request::SetTarget(_, answer), arm_state) => drop(answer.try_send(Err(arm_state.refusal()))),
-            // An arm that is not moving is already at rest.
+            // The arm is not moving, so it is already at rest.
             (Request::Stop(answer), _) => drop(answer.try_send(Ok(()))),
             (Request::Recover(answer), ArmState::Stopped { .. }) => match self.prepare() {
                 Ok(prepared) => {
@@ -198,7 +199,7 @@ impl ArmLoop {
         }
     }
 
-    /// Reopens all buses and prepares every motor; enables none.
+    /// Reopens all buses and prepares every motor without enabling it.
     fn prepare(&self) -> Result<PreparedMotors, Error> {
         let arm = &self.config.arm;
         let buses = arm.buses.iter().map(Bus::open).collect::<Result<Vec<_>, _>>()?;
@@ -336,7 +337,7 @@ impl ArmLoop {
                         let interface = &prepared.buses[bus_ix].config().interface;
                         log::debug!("{interface}: errors on the wire so far: {:?}", prepared.errors);
                         if new_errors.n_bus_off > 0 && !is_stopped {
-                            return Err(motion(format!("{interface} went off the bus")));
+                            return Err(motion(format!("{interface} went bus-off")));
                         }
                     }
                 }
@@ -345,8 +346,8 @@ impl ArmLoop {
         Ok(())
     }
 
-    /// Stops commanding: sends each motor the fail-safe command, which does what its watchdog would soon do, and
-    /// reports the reason.
+    /// Stops the arm: sends each motor the fail-safe command, which has the same effect as the expiry of its watchdog,
+    /// and logs the reason.
     fn abort(&mut self, reason: &str) {
         if let ArmState::Stopped { .. } = self.arm_state {
             return;
@@ -358,7 +359,7 @@ impl ArmLoop {
         self.stopped(reason, Some(fail_safe));
     }
 
-    /// The fail-safe command of all motors: that of `on_loss`, or to release if not all motors were enabled yet.
+    /// The fail-safe command of all motors: `on_loss`, or release if not all motors were enabled yet.
     fn fail_safe_command(&self) -> OnLoss {
         if matches!(self.arm_state, ArmState::Moving { .. }) { self.plan.on_loss } else { OnLoss::Release }
     }
@@ -373,7 +374,7 @@ impl ArmLoop {
         }
     }
 
-    /// Returns whether the arm is at rest, and brings it to rest if it moves.
+    /// Returns whether the arm is at rest. If it moves, starts to bring it to rest.
     fn is_at_rest(&mut self) -> bool {
         match &mut self.arm_state {
             ArmState::Moving { generator } => {
@@ -391,7 +392,7 @@ impl ArmLoop {
         Duration::try_from_secs_f64(max_secs).unwrap_or(Duration::ZERO) + STOP_MARGIN
     }
 
-    /// Sends the fail-safe command, and resends it until it is no longer pending.
+    /// Sends the fail-safe command, and resends it to motors that may not have received it.
     fn end(mut self) {
         let fail_safe = self.fail_safe_command();
         if let Some(prepared) = &self.prepared
@@ -415,16 +416,18 @@ impl ArmLoop {
         }
     }
 
-    /// Resends the fail-safe command once per cycle to motors without a watchdog, which would otherwise execute their
-    /// last command forever if they missed it. Continues until each of them has been heard after the timeout, when the
-    /// watchdogs of the other motors have expired, or until [`STARTUP_TIMEOUT`] after that.
+    /// Resends the fail-safe command once per cycle to motors without a watchdog, because a motor that misses it would
+    /// execute its last command forever. Continues until each of these motors has sent a frame after the watchdog
+    /// timeout, when the watchdogs of the other motors have expired, but for at most [`STARTUP_TIMEOUT`] after that
+    /// timeout.
     fn resend_fail_safe(&mut self, now: Stamp) {
         let ArmState::Stopped { since, pending_fail_safe, .. } = &mut self.arm_state else { return };
         let (Some(prepared), Some(fail_safe)) = (&self.prepared, *pending_fail_safe) else {
             *pending_fail_safe = None;
             return;
         };
-        let has_no_watchdog = |movable_motor: &MovableMotor| !self.plan.has_watchdog(&movable_motor.config().family);
+        let has_no_watchdog =
+            |movable_motor: &MovableMotor| !movable_motor.motor().protocol().watchdog(&self.plan).is_available();
         prepared.shutdown(fail_safe, has_no_watchdog);
         let watchdog_deadline = *since + self.plan.timeout;
         let all = prepared.movable_motors.iter().zip(&prepared.last_heard);
@@ -446,47 +449,12 @@ impl ArmLoop {
     }
 }
 
-impl WatchdogPlan {
-    /// Checks everything that can be checked before anything is sent.
-    pub(super) fn new(config: &MovableArmConfig) -> Result<Self, Error> {
-        let (arm, motion_config) = (&config.arm, &config.motion);
-        if motion_config.limits.len() != arm.motors.len() {
-            let reason = format!(
-                "limits are given for {} joints, but the arm has {}",
-                motion_config.limits.len(),
-                arm.motors.len()
-            );
-            return Err(Error::Motion { reason });
-        }
-        let host = unused_node(config)?;
-        let plan = Self {
-            on_loss: motion_config.on_loss,
-            timeout: motion_config.timeout,
-            accept_no_watchdog: motion_config.accept_no_watchdog,
-            endpoints: config.odrive_endpoints.clone(),
-            period: period(config, host),
-            host,
-        };
-        for motor in &arm.motors {
-            plan.check(motor, &arm.buses[motor.bus_ix].interface)?;
-        }
-        if plan.timeout < MIN_CYCLES * plan.period {
-            let reason = format!(
-                "arm.motion.timeout_millis must be at least {MIN_CYCLES} cycles of {:.1} ms",
-                1e3 * plan.period.as_secs_f64()
-            );
-            return Err(Error::Motion { reason });
-        }
-        Ok(plan)
-    }
-}
-
 impl ArmState {
     fn stopped(since: Stamp, pending_fail_safe: Option<OnLoss>) -> Self {
         Self::Stopped { since, reason: String::new(), pending_fail_safe }
     }
 
-    /// Why a target is refused.
+    /// The reason why a target is refused.
     fn refusal(&self) -> Error {
         motion(match self {
             Self::Stopped { reason, .. } => format!("the arm stopped and has not been recovered: {reason}"),
@@ -533,15 +501,15 @@ impl PreparedMotors {
         Error::Motor { joint: movable_motor.config().joint.clone(), interface, reason: reason.into() }
     }
 
-    /// Polls motors that are disabled and stay so for their positions.
+    /// Polls the positions of disabled motors without enabling them.
     fn poll_disabled(&self) -> Result<(), Error> {
         self.poll(MovableMotor::poll_frame)
     }
 
-    /// Polls motors that are executing `on_loss` for their positions, as a read-only arm does. Sends no SYNC, because
-    /// drives would then take the last target they received.
+    /// Polls the positions of motors that are executing `on_loss`, as a read-only arm does. Sends no SYNC, because on a
+    /// SYNC, drives would accept the last target that they received.
     fn poll_stopped(&self) -> Result<(), Error> {
-        self.poll(|movable_motor| movable_motor.motor().poll_frame())
+        self.poll(|movable_motor| movable_motor.motor().protocol().poll_frame())
     }
 
     fn poll(&self, poll_frame: impl Fn(&MovableMotor) -> Option<Frame>) -> Result<(), Error> {
@@ -559,7 +527,7 @@ impl PreparedMotors {
         for (ix, movable_motor) in self.movable_motors.iter().enumerate() {
             let command = movable_motor.command(setpoint.position[ix], setpoint.velocity[ix]);
             let command = command.map_err(|error| self.fault(movable_motor, error.to_string()))?;
-            // If the queue is full, the frame is dropped: the next one is more recent.
+            // If the queue is full, the frame is dropped, because the next frame is more recent.
             self.bus_of(movable_motor).send_within(&command, MAX_QUEUED)?;
         }
         self.sent_rad = setpoint.position;
@@ -576,7 +544,7 @@ impl PreparedMotors {
         Ok(())
     }
 
-    /// Sends our heartbeat, and the SYNC at which drives take their targets.
+    /// Sends our heartbeat, and the SYNC at which drives accept their targets.
     fn send_sync(&self, host: canopen::Node) -> Result<(), Error> {
         for bus in self.buses_with_drives() {
             bus.send_within(&canopen::encode_heartbeat(host, NodeState::Operational), MAX_QUEUED)?;
@@ -589,7 +557,8 @@ impl PreparedMotors {
         let has_drives = |bus_ix: usize| {
             self.movable_motors
                 .iter()
-                .any(|movable_motor| movable_motor.needs_sync() && movable_motor.config().bus_ix == bus_ix)
+                .filter(|movable_motor| movable_motor.config().bus_ix == bus_ix)
+                .any(|movable_motor| movable_motor.motor().protocol().canopen_node().is_some())
         };
         self.buses.iter().enumerate().filter(move |(ix, _)| has_drives(*ix)).map(|(_, bus)| bus)
     }
@@ -625,7 +594,7 @@ impl PreparedMotors {
         for (movable_motor, sent_rad) in
             self.movable_motors.iter().zip(&self.sent_rad).filter(|(movable_motor, _)| selects(movable_motor))
         {
-            for frame in movable_motor.shutdown(fail_safe, *sent_rad).unwrap_or_default() {
+            if let Ok(frame) = movable_motor.shutdown(fail_safe, *sent_rad) {
                 let _ = self.bus_of(movable_motor).send_within(&frame, MAX_FAIL_SAFE_WAIT);
             }
         }
@@ -665,103 +634,5 @@ fn reason_of(error: &Error) -> String {
     match error {
         Error::Motion { reason } => reason.clone(),
         other => other.to_string(),
-    }
-}
-
-/// An unused CANopen node number for this computer.
-fn unused_node(config: &MovableArmConfig) -> Result<canopen::Node, Error> {
-    let is_used = |node: canopen::Node| {
-        config.arm.motors.iter().any(|motor| matches!(motor.family, Family::Cia402 { node: used, .. } if used == node))
-    };
-    let mut numbers = (1..=127).rev().filter_map(|number| canopen::Node::new(number).ok());
-    let unused = numbers.find(|node| !is_used(*node));
-    unused.ok_or_else(|| motion("no free CANopen node number is left for this computer".to_owned()))
-}
-
-/// Cycle period that the slowest bus allows. It is rounded up to whole milliseconds if there are drives, because they
-/// count in milliseconds.
-fn period(config: &MovableArmConfig, host: canopen::Node) -> Duration {
-    let mut rate_hz = config.arm.rate_hz;
-    let is_drive = |family: &Family| matches!(family, Family::Cia402 { .. });
-    for (bus_ix, bus) in config.arm.buses.iter().enumerate() {
-        let families: Vec<_> =
-            config.arm.motors.iter().filter(|motor| motor.bus_ix == bus_ix).map(|motor| motor.family).collect();
-        if families.is_empty() {
-            continue;
-        }
-        let (mut cycle_frames, mut unsolicited) = (Vec::new(), Vec::new());
-        for traffic in families.iter().map(MovableMotor::traffic) {
-            cycle_frames.extend(traffic.cycle_frames);
-            unsolicited.extend(traffic.unsolicited);
-        }
-        if families.iter().any(is_drive) {
-            cycle_frames.extend([canopen::encode_sync(), canopen::encode_heartbeat(host, NodeState::Operational)]);
-        }
-        rate_hz = rate_hz.min(max_cycle_rate_hz(bus, &cycle_frames, &unsolicited, config.arm.rate_hz));
-    }
-    let period = Duration::from_secs_f64(1.0 / rate_hz);
-    match config.arm.motors.iter().any(|motor| is_drive(&motor.family)) {
-        true => Duration::from_millis(period.as_nanos().div_ceil(1_000_000).try_into().unwrap_or(u64::MAX)),
-        false => period,
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::super::config::{ArmConfig, BusConfig, MotorConfig};
-    use super::*;
-    use crate::motion::{MotionConfig, OnLoss};
-    use crate::wire::can::cia402::Units;
-
-    fn config(families: Vec<Family>) -> MovableArmConfig {
-        let motors = families.into_iter().map(|family| MotorConfig {
-            joint: "any".to_owned(),
-            bus_ix: 0,
-            family,
-            gear_ratio: 1.0,
-            is_reversed: false,
-            offset_rad: 0.0,
-            gains: None,
-        });
-        MovableArmConfig {
-            arm: ArmConfig {
-                buses: vec![BusConfig {
-                    interface: "can0".to_owned(),
-                    bitrate_hz: 1_000_000,
-                    data_bitrate_hz: None,
-                    accept_no_restart: false,
-                }],
-                motors: motors.collect(),
-                rate_hz: 1000.0,
-            },
-            motion: MotionConfig {
-                limits: Vec::new(),
-                on_loss: OnLoss::Release,
-                timeout: Duration::from_millis(100),
-                accept_no_watchdog: false,
-            },
-            odrive_endpoints: None,
-        }
-    }
-
-    #[test]
-    fn cycle_keeps_bus_load_under_70_percent() {
-        let host = canopen::Node::new(127).expect("a node");
-        let damiao = |ix: u16| Family::Damiao { motor: ix, feedback: 0x10 + ix };
-        assert_eq!(period(&config(vec![damiao(1), damiao(2)]), host), Duration::from_millis(1));
-        // Seven motors with two frames each, at most 135 bits per frame.
-        let seven = period(&config((1..8).map(damiao).collect()), host).as_secs_f64();
-        assert!((seven - 14.0 * 135e-6 / 0.7).abs() < 1e-6, "{seven}");
-    }
-
-    #[test]
-    fn drives_get_whole_millisecond_period_and_unused_node() {
-        let node = |number| canopen::Node::new(number).expect("a node");
-        let drive =
-            |number| Family::Cia402 { node: node(number), units: Units { counts_per_turn: 1.0, rated_torque_nm: 1.0 } };
-        let arm = config(vec![drive(127), drive(126), drive(1)]);
-        assert_eq!(unused_node(&arm).expect("125 are free"), node(125));
-        // 9 x 135 bits, a SYNC of 55 and a heartbeat of 65 take 1.34 ms of 70 %: 1.91 ms.
-        assert_eq!(period(&arm, node(125)), Duration::from_millis(2));
     }
 }

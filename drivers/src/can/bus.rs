@@ -1,6 +1,7 @@
 //! One CAN bus: sends frames, and receives frames and errors with the kernel's time stamps.
 
 use super::config::BusConfig;
+use super::frame_io::{BusEvent, FrameIo, WireErrors};
 use super::link::Link;
 use crate::wire::can::frame::Stuffing;
 use crate::wire::can::{Frame, Id};
@@ -16,78 +17,10 @@ use std::io;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
-/// How long sending is retried while the interface's queue is full.
+/// Maximum time for which sending is retried while the interface's queue is full.
 const MAX_SENDING: Duration = Duration::from_millis(20);
 /// `errno` for "no buffer space": the interface's queue is full.
 const ENOBUFS: i32 = 105;
-
-/// Something received from the bus.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub enum BusEvent {
-    /// A frame from another node.
-    Frame(Frame),
-    /// Errors on the wire, reported by the controller.
-    Errors(WireErrors),
-}
-
-/// Counters of error frames. One error frame may report several errors.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct WireErrors {
-    /// Error frames.
-    pub n_frames: u64,
-    /// The controller went off the bus.
-    pub n_bus_off: u64,
-    /// The controller restarted.
-    pub n_restarts: u64,
-    /// The controller reached its warning level of 96 errors.
-    pub n_warnings: u64,
-    /// The controller became error-passive, at 128 errors.
-    pub n_passive: u64,
-    /// Nobody acknowledged a frame: there is no other node, or none at this bit rate.
-    pub n_unacknowledged: u64,
-    /// Frames dropped because a buffer of the controller or the kernel was full.
-    pub n_overflows: u64,
-}
-
-impl WireErrors {
-    fn of(frame: CanErrorFrame) -> Self {
-        let error = frame.into_error();
-        let problems = error.controller();
-        let has = |problem| problems.is_some_and(|problems| problems.contains(problem));
-        Self {
-            n_frames: 1,
-            n_bus_off: error.is_bus_off().into(),
-            n_restarts: error.is_restarted().into(),
-            n_warnings: (has(ControllerProblems::RX_WARNING) || has(ControllerProblems::TX_WARNING)).into(),
-            n_passive: (has(ControllerProblems::RX_PASSIVE) || has(ControllerProblems::TX_PASSIVE)).into(),
-            n_unacknowledged: error.is_no_ack().into(),
-            n_overflows: (has(ControllerProblems::RX_OVERFLOW) || has(ControllerProblems::TX_OVERFLOW)).into(),
-        }
-    }
-
-    /// Adds the counters of `other`.
-    pub fn add(&mut self, other: &Self) {
-        self.n_frames += other.n_frames;
-        self.n_bus_off += other.n_bus_off;
-        self.n_restarts += other.n_restarts;
-        self.n_warnings += other.n_warnings;
-        self.n_passive += other.n_passive;
-        self.n_unacknowledged += other.n_unacknowledged;
-        self.n_overflows += other.n_overflows;
-    }
-}
-
-impl std::fmt::Display for WireErrors {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let Self { n_frames, n_bus_off, n_restarts, n_warnings, n_passive, n_unacknowledged, n_overflows } = self;
-        let times = if *n_bus_off == 1 { "time" } else { "times" };
-        write!(
-            f,
-            "{n_bus_off} {times} off the bus, {n_restarts} restarts; {n_warnings} warnings, {n_passive} passive, \
-             {n_unacknowledged} frames not acknowledged, {n_overflows} overflows; {n_frames} error frames in total"
-        )
-    }
-}
 
 /// An open bus. Dropping it closes the socket and does not change the interface.
 #[derive(Debug)]
@@ -102,7 +35,7 @@ impl Bus {
     /// Opens an interface and checks that it is set up as in `config`.
     ///
     /// # Errors
-    /// If it is not. The error contains the command that sets it up.
+    /// If the interface is not set up as in `config`. The error contains the command that sets it up.
     pub fn open(config: &BusConfig) -> Result<Self, Error> {
         Link::read(&config.interface)?.check(config)?;
         let open = CanFdSocket::open(&config.interface).and_then(|socket| {
@@ -128,8 +61,8 @@ impl Bus {
     /// Sends a frame, and waits briefly while the interface's queue is full. Returns whether the kernel accepted the
     /// frame.
     ///
-    /// It returns `false` if the queue stayed full, which happens if no node acknowledges. `true` does not mean that
-    /// the frame was sent: the kernel accepts and drops frames for a controller that is off the bus.
+    /// It returns `false` if the queue stayed full, which happens if no node acknowledges frames. `true` does not mean
+    /// that the frame was sent: the kernel accepts and drops frames while the controller is bus-off.
     pub fn send(&self, frame: &Frame) -> Result<bool, Error> {
         self.send_within(frame, MAX_SENDING)
     }
@@ -190,10 +123,10 @@ impl Bus {
             Err(source) => return Err(self.bus_error(source)),
         };
         let now = clock::now();
-        // The kernel stamps with the wall clock. The age of the frame converts that to our clock.
+        // The kernel stamps frames with the wall clock. The age of the frame is used to convert the stamp to our clock.
         let stamp = at.elapsed().map_or(now, |age| now - age);
         let frame = match frame {
-            CanAnyFrame::Error(error) => return Ok(Some((stamp, BusEvent::Errors(WireErrors::of(error))))),
+            CanAnyFrame::Error(error) => return Ok(Some((stamp, BusEvent::Errors(wire_errors(error))))),
             CanAnyFrame::Normal(frame) => Frame::classic(id_of(&frame), frame.data()),
             CanAnyFrame::Remote(frame) => Frame::remote(id_of(&frame), frame.dlc()),
             CanAnyFrame::Fd(frame) => Frame::fd(id_of(&frame), frame.data(), frame.is_brs()),
@@ -211,6 +144,36 @@ impl Bus {
 
     fn bus_error(&self, reason: io::Error) -> Error {
         Error::CanBus { interface: self.config.interface.clone(), reason }
+    }
+}
+
+impl FrameIo for Bus {
+    fn interface(&self) -> &str {
+        &self.config.interface
+    }
+
+    fn send(&self, frame: &Frame) -> Result<bool, Error> {
+        Self::send(self, frame)
+    }
+
+    fn receive(&self, timeout: Duration) -> Result<Option<(Stamp, BusEvent)>, Error> {
+        Self::receive(self, timeout)
+    }
+}
+
+/// Counts the errors that an error frame reports.
+fn wire_errors(frame: CanErrorFrame) -> WireErrors {
+    let error = frame.into_error();
+    let problems = error.controller();
+    let has = |problem| problems.is_some_and(|problems| problems.contains(problem));
+    WireErrors {
+        n_frames: 1,
+        n_bus_off: error.is_bus_off().into(),
+        n_restarts: error.is_restarted().into(),
+        n_warnings: (has(ControllerProblems::RX_WARNING) || has(ControllerProblems::TX_WARNING)).into(),
+        n_passive: (has(ControllerProblems::RX_PASSIVE) || has(ControllerProblems::TX_PASSIVE)).into(),
+        n_unacknowledged: error.is_no_ack().into(),
+        n_overflows: (has(ControllerProblems::RX_OVERFLOW) || has(ControllerProblems::TX_OVERFLOW)).into(),
     }
 }
 

@@ -8,7 +8,7 @@ use crate::wire::can::frame::{Stuffing, load_frac};
 /// send, too.
 const MAX_LOAD_FRAC: f64 = 0.7;
 
-/// Cycles per second: the requested rate, or the highest that keeps the bus load within bounds.
+/// Rate of cycles, Hz: the requested rate, or the highest rate that keeps the bus load within its limit.
 ///
 /// `cycle_frames`: all frames of a cycle, sent and received. `unsolicited`: other frames, with their rate in Hz.
 pub(super) fn max_cycle_rate_hz(

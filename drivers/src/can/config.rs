@@ -1,9 +1,10 @@
 //! Configuration of buses, motors and arms.
 
+use super::family::MotorProtocol;
+use super::odrive::Endpoints;
 use crate::motion::MotionConfig;
 use crate::wire::can::frame::BitRates;
-use crate::wire::can::odrive::Endpoints;
-use crate::wire::can::{canopen, cia402, odrive, robstride, tmotor};
+use std::sync::Arc;
 
 /// Configuration of an arm from the rig file.
 #[derive(Clone, Debug, PartialEq)]
@@ -23,7 +24,7 @@ pub struct MovableArmConfig {
     pub arm: ArmConfig,
     /// Limits of each joint, in the order of the motors, and the fail-safe behavior if this computer stops sending.
     pub motion: MotionConfig,
-    /// Endpoint numbers of `ODrive` axes. Without them their watchdog cannot be set.
+    /// Endpoint numbers of `ODrive` axes. Without them, the watchdog of the axes cannot be set.
     pub odrive_endpoints: Option<Endpoints>,
 }
 
@@ -36,8 +37,8 @@ pub struct BusConfig {
     pub bitrate_hz: u32,
     /// Bit rate of the data phase of FD frames, bit/s; `None` on a classic bus.
     pub data_bitrate_hz: Option<u32>,
-    /// Accept that the kernel cannot restart the adapter, as with serial-line adapters (`slcan`): once off the bus,
-    /// it stays off.
+    /// Accept that the kernel cannot restart the adapter, as with serial-line adapters (`slcan`). After a
+    /// bus-off, such an adapter stays bus-off.
     pub accept_no_restart: bool,
 }
 
@@ -49,74 +50,18 @@ impl BusConfig {
     }
 }
 
-/// Protocol of a motor, and its address on the bus.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Family {
-    /// Damiao: motor ID, and the identifier of its answers (register `MST_ID`). The ranges of its raw values are read
-    /// from the motor.
-    Damiao {
-        /// Motor ID.
-        motor: u16,
-        /// Identifier of its answers.
-        feedback: u16,
-    },
-    /// Robstride, private protocol.
-    Robstride {
-        /// Motor ID.
-        motor: u8,
-        /// Model, which determines the ranges of its raw values.
-        model: robstride::Model,
-    },
-    /// T-Motor AK in MIT mode. A read-only arm only listens to it.
-    TMotor {
-        /// Motor ID.
-        motor: u8,
-        /// Model, which determines the ranges of its raw values.
-        model: tmotor::Model,
-    },
-    /// ODrive CANSimple.
-    Odrive {
-        /// Node ID of the axis.
-        node: odrive::Node,
-    },
-    /// CiA 402 drive.
-    Cia402 {
-        /// Node ID.
-        node: canopen::Node,
-        /// Units of its raw values.
-        units: cia402::Units,
-    },
-}
-
-impl Family {
-    /// Whether the two motors could not be distinguished on the same bus.
-    pub fn conflicts_with(&self, other: &Self) -> bool {
-        match (self, other) {
-            // A motor would take the answers of the other one for commands.
-            (Self::Damiao { motor: a, feedback: b }, Self::Damiao { motor: c, feedback: d }) => {
-                a == c || b == d || a == d || b == c
-            }
-            (Self::Robstride { motor: a, .. }, Self::Robstride { motor: b, .. })
-            | (Self::TMotor { motor: a, .. }, Self::TMotor { motor: b, .. }) => a == b,
-            (Self::Odrive { node: a }, Self::Odrive { node: b }) => a == b,
-            (Self::Cia402 { node: a, .. }, Self::Cia402 { node: b, .. }) => a == b,
-            _ => false,
-        }
-    }
-}
-
 /// A motor and its joint: `joint = direction * motor / gear_ratio + offset_rad`, where the direction is -1 if the
 /// motor is reversed.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug)]
 pub struct MotorConfig {
     /// Name of the joint that it moves.
     pub joint: String,
     /// Index of its bus in [`ArmConfig::buses`].
     pub bus_ix: usize,
-    /// Its protocol.
-    pub family: Family,
-    /// Turns of the reported shaft per turn of the joint: 1 if the motor reports its output shaft and no further gear
-    /// follows.
+    /// Its protocol, and its address on the bus.
+    pub protocol: Arc<dyn MotorProtocol>,
+    /// Turns that the motor reports per turn of the joint. It is 1 if the motor reports the angle of its output shaft
+    /// and drives the joint directly.
     pub gear_ratio: f64,
     /// Whether it turns in the opposite direction to its joint.
     pub is_reversed: bool,
@@ -124,6 +69,16 @@ pub struct MotorConfig {
     pub offset_rad: f64,
     /// Gains for families whose commands include them (MIT mode); `None` if the motor is only read.
     pub gains: Option<Gains>,
+}
+
+// This is not derived, because the derived code would move the trait object (rust-lang/rust#31740).
+impl PartialEq for MotorConfig {
+    fn eq(&self, other: &Self) -> bool {
+        let Self { joint, bus_ix, protocol, gear_ratio, is_reversed, offset_rad, gains } = self;
+        protocol.as_ref() == other.protocol.as_ref()
+            && (joint, bus_ix, is_reversed) == (&other.joint, &other.bus_ix, &other.is_reversed)
+            && (gear_ratio, offset_rad, gains) == (&other.gear_ratio, &other.offset_rad, &other.gains)
+    }
 }
 
 /// Stiffness and damping of a joint. A motor in front of a gear gets both divided by the square of the gear ratio.

@@ -22,7 +22,7 @@ impl Joints {
         Self { newest: vec![None; n] }
     }
 
-    /// Adds a reading. Once every joint has one, returns a state and starts over.
+    /// Adds a reading. Once every joint has a new reading, returns a state and starts over.
     pub(super) fn take(&mut self, joint_reading: &JointReading) -> Option<JointState> {
         self.newest[joint_reading.joint_ix] = Some((joint_reading.stamp, joint_reading.reading));
         let all = self.newest.iter().copied().collect::<Option<Vec<_>>>()?;

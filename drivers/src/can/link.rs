@@ -1,4 +1,4 @@
-//! Checks the configuration of a CAN interface, and names the command that repairs it.
+//! Checks the configuration of a CAN interface and returns the command that repairs it.
 
 use super::config::BusConfig;
 use super::interfaces::interfaces;
@@ -8,21 +8,22 @@ use socketcan::nl::{CanState, InterfaceDetails, Mtu};
 use std::io;
 use std::path::Path;
 
-/// Time after which a controller that went off the bus restarts, in our configuration, milliseconds.
+/// Time from a bus-off to the automatic restart in the commands that we print, milliseconds.
 const RESTART_MILLIS: u32 = 100;
 
 /// State of a controller according to its error counters.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum State {
-    /// Fewer than 96 errors.
+    /// Both error counters are below 96.
     Active,
-    /// At least 96 errors.
+    /// An error counter has reached 96.
     Warning,
-    /// At least 128 errors: it no longer sends active error flags, which would destroy frames of others.
+    /// An error counter has reached 128. The controller no longer sends active error flags, which would destroy the
+    /// frames of other nodes.
     Passive,
-    /// At least 256 errors: it takes no part in the bus until it is restarted.
+    /// The transmit error counter has exceeded 255. The controller takes no part in the bus until it is restarted.
     BusOff,
-    /// Down or asleep.
+    /// The controller is down or asleep.
     Stopped,
 }
 
@@ -35,13 +36,13 @@ pub struct Link {
     pub is_up: bool,
     /// Whether it accepts FD frames.
     pub is_fd: bool,
-    /// Bit rate, bit/s; `None` if it has none (virtual interfaces) or none is set.
+    /// Bit rate, bit/s; `None` for virtual interfaces, or if none is set.
     pub bitrate_hz: Option<u32>,
     /// Bit rate of the data phase of FD frames, bit/s.
     pub data_bitrate_hz: Option<u32>,
-    /// Time after which it restarts automatically when off the bus, milliseconds; 0 means never.
+    /// Time from a bus-off to the automatic restart, milliseconds; 0 means no restart.
     pub restart_millis: Option<u32>,
-    /// State according to its error counters; `None` if it has no counters.
+    /// State of the controller according to its error counters; `None` for virtual interfaces.
     pub state: Option<State>,
     /// Current transmit and receive error counters.
     pub n_errors: Option<[u16; 2]>,
@@ -127,13 +128,13 @@ impl Link {
         }
         if self.restart_millis == Some(0) && !config.accept_no_restart {
             report(format!(
-                "it does not restart after it goes off the bus (restart-ms 0; for an adapter without automatic restart, on a serial \
+                "it does not restart after a bus-off (restart-ms 0; for an adapter without automatic restart, on a serial \
                  line for instance, set arm.bus.{}.accept_no_restart = true)",
                 self.interface
             ));
         }
         if self.is_up && self.state >= Some(State::BusOff) {
-            report("it is off the bus: check wiring, termination and the bit rate of the other nodes".to_owned());
+            report("it is bus-off: check wiring, termination and the bit rate of the other nodes".to_owned());
         }
         problems
     }
@@ -168,7 +169,7 @@ impl std::fmt::Display for Link {
     }
 }
 
-/// Command that sets an interface up as configured.
+/// Shell command that configures an interface as in the rig file.
 fn set_up_command(interface: &str, is_virtual: bool, config: &BusConfig) -> String {
     if is_virtual {
         return match config.data_bitrate_hz {
@@ -248,8 +249,8 @@ mod tests {
                 "its bit rate is 500000, but the rig file requires 1000000",
             ),
             (Link { bitrate_hz: None, ..good_link() }, "no bit rate is set"),
-            (Link { restart_millis: Some(0), ..good_link() }, "does not restart after it goes off the bus"),
-            (Link { state: Some(State::BusOff), ..good_link() }, "off the bus"),
+            (Link { restart_millis: Some(0), ..good_link() }, "does not restart after a bus-off"),
+            (Link { state: Some(State::BusOff), ..good_link() }, "bus-off"),
         ];
         for (link, what) in broken_links {
             let problems = link.problems(&config(None));

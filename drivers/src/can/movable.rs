@@ -7,7 +7,7 @@ use super::arm::MAX_WAITING;
 use super::arm_loop::{ArmLoop, Request};
 use super::config::MovableArmConfig;
 use super::joints::{JointReading, Joints};
-use super::watchdog::WatchdogPlan;
+use super::plan::watchdog_plan;
 use crate::motion::{JointTarget, Motion, MovableArm};
 use crate::{Arm, Error};
 use kinematics::JointState;
@@ -23,10 +23,10 @@ const MAX_ANSWER: Duration = Duration::from_secs(1);
 /// Maximum time to recover. Preparing and enabling takes some hundred milliseconds per motor.
 const MAX_RECOVERY: Duration = Duration::from_secs(60);
 
-/// An arm that is held where it was found, and may be moved.
+/// An arm that may be moved. After opening, it holds its current position.
 ///
-/// Dropping it brings it to rest within its limits. Then each motor gets the fail-safe command for `on_loss`; motors
-/// without a watchdog get it repeatedly until they answer, for a limited time.
+/// Dropping this value brings the arm to rest within its limits. Then each motor gets the fail-safe command for
+/// `on_loss`; motors without a watchdog get it repeatedly until they answer, for a limited time.
 #[derive(Debug)]
 pub struct MovableCanArm {
     names: Vec<String>,
@@ -39,16 +39,17 @@ pub struct MovableCanArm {
 }
 
 impl MovableCanArm {
-    /// Checks what can be checked without the motors: the limits, and whether each motor supports the configuration.
+    /// Makes the checks that need no connection to the motors: the limits, and whether each motor supports the
+    /// configuration.
     pub fn check(config: &MovableArmConfig) -> Result<(), Error> {
-        WatchdogPlan::new(config).map(drop)
+        watchdog_plan(config).map(drop)
     }
 
     /// Checks the capabilities of the motors, sets and verifies their timeouts, and enables them, holding their
     /// positions.
     ///
     /// # Errors
-    /// If anything fails. All motors are left disabled then.
+    /// If any step fails. All motors are then disabled.
     pub fn open(config: &MovableArmConfig) -> Result<Self, Error> {
         let names: Vec<String> = config.arm.motors.iter().map(|motor| motor.joint.clone()).collect();
         let (sender, readings) = sync_channel(MAX_WAITING);
@@ -84,8 +85,8 @@ impl Arm for MovableCanArm {
         &self.names
     }
 
-    /// Like [`CanArm`](super::CanArm). A stopped arm is still read, as long as its motors report without commands and
-    /// without a SYNC.
+    /// Reads the arm like [`CanArm`](super::CanArm). A stopped arm can still be read if its motors report without
+    /// commands and without a SYNC.
     fn read(&mut self, timeout: Duration) -> Result<JointState, Error> {
         let deadline = Instant::now() + timeout;
         loop {

@@ -14,20 +14,20 @@ use std::path::{Path, PathBuf};
 pub struct Dataset {
     /// The folder.
     pub path: PathBuf,
-    /// Sorted by file name (nerfstudio) or time (TUM); never empty.
+    /// Images, sorted by file name (nerfstudio) or time (TUM); never empty.
     pub images: Vec<DatasetImage>,
     /// Number of images skipped because their file does not exist.
     pub n_missing: usize,
-    /// Number of images skipped because their file is broken, or they have no pose or depth close enough in time.
+    /// Number of images skipped because their file is corrupt, or no pose or depth is close enough in time.
     pub n_unusable: usize,
     /// Notes for the user: one sentence each, with the names of the first skipped images.
     pub notes: Vec<String>,
-    /// Broken data that are missing from the result: one sentence each.
+    /// Messages about corrupt data that are missing from the result: one sentence each.
     pub data_losses: Vec<String>,
 }
 
 impl Dataset {
-    /// Whether the stamps are real times. Otherwise, they only count the images.
+    /// Whether the stamps are real times. If not, they only number the images.
     pub fn has_times(&self) -> bool {
         !is_nerfstudio(&self.path) && self.path.join(tum::COLOR_LIST).is_file()
     }
@@ -60,7 +60,7 @@ const MAX_POSITION_M: f64 = 1e4;
 #[derive(Debug, Default)]
 struct SkippedImages {
     missing: Vec<String>,
-    /// Names with the reason; also in `broken`.
+    /// Names of unusable images with the reason; also in `broken`.
     unusable: Vec<(String, String)>,
     broken: Vec<(String, String)>,
 }
@@ -93,7 +93,7 @@ fn unusable_note(images: &[(String, String)]) -> Option<String> {
     (!named.is_empty()).then(|| format!("{n_images} cannot be used: {}", first_names(&named)))
 }
 
-/// Noun with count, and verb: `1 image` and `is`, `2 images` and `are`.
+/// Returns a noun with its count, and the matching verb: `1 image` and `is`, `2 images` and `are`.
 fn plural(n: usize, noun: &str) -> (String, &'static str) {
     if n == 1 { (format!("1 {noun}"), "is") } else { (format!("{n} {noun}s"), "are") }
 }

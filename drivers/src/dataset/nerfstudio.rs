@@ -1,6 +1,6 @@
 //! Folders with a `transforms.json`, as written by nerfstudio and instant-ngp.
 //!
-//! Their cameras look along -z with y up (OpenGL). Poses are converted to our convention only here.
+//! Cameras in these files look along -z with y up (OpenGL). Poses are converted to our convention only in this module.
 
 use super::posed_image::image_size_px;
 use super::{Dataset, DatasetImage, DepthFile, MAX_POSITION_M, SkippedImages, plural};
@@ -120,14 +120,14 @@ struct Document {
     camera: CameraEntry,
 }
 
-/// One frame. Its own lens parameters override the common ones.
+/// One frame. Lens parameters of the frame override the common ones.
 #[derive(Deserialize)]
 struct FrameEntry {
     file_path: String,
     depth_file_path: Option<String>,
     mask_path: Option<String>,
     transform_matrix: Matrix,
-    /// Our extension: pose of the depth camera if it differs from that of the photo.
+    /// Pose of the depth camera, if it differs from that of the photo. This field is our extension.
     depth_transform_matrix: Option<Matrix>,
     #[serde(flatten)]
     camera: CameraEntry,
@@ -197,7 +197,7 @@ fn world_from_camera(rows: &[f64; 16]) -> Result<Transform, String> {
     Ok(world_from_opengl * opengl_from_camera())
 }
 
-/// Largest absolute coordinate of a pose if it exceeds the maximum.
+/// Largest absolute coordinate of a pose, if it exceeds the maximum.
 fn excessive_distance_m(pose: Transform) -> Option<f64> {
     let excessive_distance_m = pose.translation.vector.amax();
     (excessive_distance_m > MAX_POSITION_M).then_some(excessive_distance_m)
@@ -210,7 +210,7 @@ pub fn opengl_from_camera() -> Transform {
 }
 
 impl CameraEntry {
-    /// These parameters if set, else the common ones.
+    /// Returns these parameters, and the common ones where they are not set.
     fn or(&self, common: &Self) -> Self {
         let model = || self.camera_model.clone().or_else(|| common.camera_model.clone());
         Self {
@@ -277,7 +277,7 @@ impl CameraEntry {
     }
 }
 
-/// The file of this name, or of this name plus one of the known extensions.
+/// Finds the file with this name, or with this name plus one of the known extensions.
 fn find_image(folder: &Path, name: &str) -> Option<PathBuf> {
     let as_named = folder.join(name);
     if as_named.is_file() {
@@ -300,8 +300,8 @@ fn nan_as_null(text: &str) -> String {
         if ix > 0 {
             out.push('"');
         }
-        // An escaped quote in a name shifts which parts count as strings. Names do not contain these words, so nothing
-        // changes for them.
+        // An escaped quote in a name changes which parts count as strings. Names do not contain these words, so this
+        // has no effect.
         if ix % 2 == 0 && (part.contains("NaN") || part.contains("Infinity")) {
             out.push_str(&part.replace("-Infinity", "null").replace("Infinity", "null").replace("NaN", "null"));
         } else {

@@ -15,7 +15,8 @@ pub struct DatasetImage {
     pub intrinsics: Intrinsics,
     /// Pose at `stamp`.
     pub world_from_camera: Transform,
-    /// When the photo was taken. If the dataset has no times, images are 1 ms apart in the order of their names.
+    /// Time at which the photo was taken. If the dataset has no times, images are 1 ms apart in the order of their
+    /// names.
     pub stamp: Stamp,
     /// The color image.
     pub image_path: PathBuf,
@@ -30,7 +31,7 @@ pub struct DatasetImage {
 pub struct DepthFile {
     /// The file.
     pub path: PathBuf,
-    /// Meters per count; a count of 0 is unknown.
+    /// Meters per count; a count of 0 means that the depth is unknown.
     pub meters_per_count: f64,
     /// Pose of the depth camera when the depth image was taken.
     pub world_from_camera: Transform,
@@ -44,7 +45,7 @@ pub struct LoadedImage {
     pub rgba_srgb: Vec<u8>,
     /// Depth, still distorted.
     pub depth: Option<DepthImage>,
-    /// Why depth is missing although the image has a depth file.
+    /// Reason why depth is missing although the image has a depth file.
     pub depth_error: Option<String>,
 }
 

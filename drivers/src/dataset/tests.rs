@@ -1,4 +1,4 @@
-//! Tests with real dataset folders and with small folders created here.
+//! Tests with real dataset folders and with small folders that the tests create.
 
 use super::*;
 use crate::test_data;

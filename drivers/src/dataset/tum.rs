@@ -14,13 +14,14 @@ use std::path::Path;
 pub const COLOR_LIST: &str = "rgb.txt";
 const DEPTH_LIST: &str = "depth.txt";
 const POSE_LIST: &str = "groundtruth.txt";
-/// Optional: `fx fy cx cy`, then optionally `k1 k2 p1 p2 k3`, with pixel centers at integers as in OpenCV.
+/// Optional file with the lens parameters: `fx fy cx cy`, then optionally `k1 k2 p1 p2 k3`, with pixel centers at
+/// integers as in OpenCV.
 const CAMERA_FILE: &str = "calibration.txt";
 /// Maximum time between samples that are matched to each other.
 const MAX_GAP_NANOS: i64 = 20_000_000;
 const METERS_PER_COUNT: f64 = 1.0 / 5000.0;
 
-/// Cameras of the benchmark by a part of the folder name: `fx fy cx cy`, then `k1 k2 p1 p2 k3`.
+/// Lens parameters of the cameras of the benchmark, by a part of the folder name: `fx fy cx cy`, then `k1 k2 p1 p2 k3`.
 const CAMERAS: [(&str, [f64; 9]); 3] = [
     ("freiburg1", [517.306408, 516.469215, 318.643040, 255.313989, 0.262383, -0.953104, -0.005358, 0.002628, 1.163314]),
     (
@@ -74,7 +75,7 @@ pub fn read(folder: &Path) -> Result<Dataset, Error> {
     skipped.dataset(folder, images, notes)
 }
 
-/// Lens parameters. The caller sets the size to that of each photo.
+/// Lens parameters of a folder. The caller sets the size to that of each photo.
 fn camera_of(folder: &Path) -> Result<Intrinsics, Error> {
     let path = folder.join(CAMERA_FILE);
     let numbers = match std::fs::read_to_string(&path) {

@@ -1,4 +1,4 @@
-//! A read-only arm. A thread receives the robot's states; the caller gets them as joint states.
+//! A read-only arm. A thread receives the robot's states, and the caller gets joint states.
 
 #[cfg(any(test, fuzzing))]
 pub(crate) mod fuzz;
@@ -23,12 +23,13 @@ use std::time::{Duration, Instant};
 const MAX_WAITING: usize = 1000;
 /// A robot that sends nothing for this long counts as lost.
 const MAX_SILENCE: Duration = Duration::from_secs(1);
-/// Maximum difference between our forward kinematics and the robot's own. Beyond it, the description is of another
+/// Maximum difference between our forward kinematics and the robot's own. Beyond it, the description belongs to another
 /// robot.
 const MAX_POSE_ERROR_M: f64 = 2e-3;
 const MAX_POSE_ERROR_RAD: f64 = 0.5 / 180.0 * std::f64::consts::PI;
 const NANOS_PER_STATE: i64 = 1_000_000;
-/// A robot that got no answer for this long has given up. States that arrived in the meantime are not answered.
+/// A robot that received no answer for this long has stopped waiting. States that arrived in the meantime are not
+/// answered.
 const MAX_RESPONSE_GAP: Duration = Duration::from_millis(20);
 
 /// Configuration of an arm from the rig file.
@@ -42,7 +43,7 @@ pub struct ArmConfig {
     pub chain: Chain,
 }
 
-/// A read-only Franka arm. Nothing here moves it. Dropping it frees the robot's interface.
+/// A read-only Franka arm, which cannot be moved. Dropping it frees the robot's interface.
 #[derive(Debug)]
 pub struct FrankaArm {
     device: String,
@@ -90,7 +91,7 @@ impl FrankaArm {
         let deadline = clock::now() + MAX_SILENCE;
         let mut buffer = [0; MAX_STATE_BYTES];
         let first = loop {
-            // After a receive error a state may still arrive.
+            // After a receive error, a state may still arrive.
             let n = network.udp.blocking_receive(&mut buffer).unwrap_or(0);
             match decode(version, &buffer[..n]) {
                 Some(first) => break first.state,
@@ -133,8 +134,8 @@ impl Arm for FrankaArm {
         &self.names
     }
 
-    /// States are stamped by the robot's clock, mapped to ours. Efforts are the measured link-side torques, including
-    /// gravity.
+    /// Returns the next state. Its stamp is the robot's clock, mapped to ours. Efforts are the measured link-side
+    /// torques, including gravity.
     fn read(&mut self, timeout: Duration) -> Result<JointState, Error> {
         let deadline = Instant::now() + timeout;
         let mut state = self.shared.state.lock();
@@ -165,7 +166,7 @@ impl Drop for FrankaArm {
     }
 }
 
-/// Compares the flange pose according to the rig file with the one that the robot reports.
+/// Compares the flange pose according to the rig file with the pose that the robot reports.
 fn check_kinematics(config: &ArmConfig, state: &RobotState) -> Result<(), String> {
     let chain = &config.chain;
     let chain_error = |error: kinematics::Error| error.to_string();
@@ -245,7 +246,8 @@ impl StateReader {
     fn read(&mut self, session: &Session, shared: &Shared) -> Result<(), String> {
         let network = &session.network;
         let mut buffer = [0; MAX_STATE_BYTES];
-        // States that queued up meanwhile arrive at once, so they are useless for estimating the robot's clock.
+        // States that were queued in the meantime arrive all at once, so they are useless for estimating the robot's
+        // clock.
         while let Ok(Some(_)) = network.udp.try_receive(&mut buffer) {}
         let mut last_received = clock::now();
         loop {
@@ -302,7 +304,7 @@ impl StateReader {
         !state_queue.stop
     }
 
-    /// Queues a state if it is later than all before it, and returns its stamp on our clock.
+    /// Queues a state if it is later than all earlier states, and returns its stamp on our clock.
     fn take(&mut self, state_queue: &mut StateQueue, numbered: &NumberedState, at: Stamp) -> Option<Stamp> {
         let NumberedState { number, state } = numbered;
         let statistics = &mut state_queue.statistics;

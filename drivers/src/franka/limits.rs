@@ -8,14 +8,14 @@ use franka::rate_limiting::{self, fer, limit_rate_joint_positions};
 
 /// Fraction of the robot's maximum velocity and acceleration that we use. The rest is a reserve for lost commands.
 const LIMIT_FRAC: f64 = 0.5;
-/// Fraction of its maximum jerk. After a command is lost unnoticed, the next one appears to the robot with four times
-/// its jerk.
+/// Fraction of the robot's maximum jerk that we use. If a command is lost and we do not notice, the next command
+/// appears to the robot with four times its jerk.
 const JERK_LIMIT_FRAC: f64 = 0.25 * LIMIT_FRAC;
 /// Distance of targets from the ends of a joint's range.
 const MARGIN_RAD: f64 = 5e-3;
 /// Margin subtracted from the velocity near the end of a range, in addition to the robot's own.
 const SPEED_MARGIN_RAD_S: f64 = 1e-2;
-/// Smaller changes by the rate limiter are rounding errors.
+/// Changes by the rate limiter that are smaller than this are rounding errors.
 const UNCHANGED_RAD: f64 = 1e-9;
 
 /// Limits of one robot.
@@ -30,9 +30,9 @@ pub(super) struct RobotLimits {
 /// Velocity limits of the joints.
 #[derive(Clone, Debug)]
 enum SpeedLimits {
-    /// The same everywhere.
+    /// Limits that do not depend on the position.
     Constant([f64; N_JOINTS]),
-    /// Lower towards the ends of their ranges.
+    /// Limits that are lower towards the ends of the joint ranges.
     PositionDependent(Box<JointVelocityLimitsConfig>),
 }
 
@@ -62,7 +62,7 @@ impl RobotLimits {
         })
     }
 
-    /// Limits for our motions: at most the requested ones, and at most our fraction of the robot's.
+    /// Limits for our motions: at most the requested limits, and at most our fraction of the robot's limits.
     ///
     /// A joint that decelerates with `a` towards its target has the velocity `sqrt(2 a d)` at the distance `d`. An
     /// FR3 allows `sqrt(2 D (d + m)) - o` there, where `m` is the distance from the target to the end of the range.
@@ -104,8 +104,8 @@ impl RobotLimits {
     /// Limits the rates of a position to be sent, so that the robot does not trigger a reflex. Returns the position
     /// and whether it was changed.
     ///
-    /// This is libfranka's rate limiter. We leave out its low-pass filter: our setpoints are smooth, and the filter
-    /// would only delay them.
+    /// This is libfranka's rate limiter without its low-pass filter: our setpoints are smooth, and the filter would
+    /// only delay them.
     pub(super) fn limited(
         &self,
         requested_rad: [f64; N_JOINTS],
@@ -115,7 +115,7 @@ impl RobotLimits {
             SpeedLimits::Constant(max_speed) => (*max_speed, max_speed.map(|max_speed| -max_speed)),
             SpeedLimits::PositionDependent(joints) => {
                 let at = &reference.position_rad;
-                // A joint beyond the end of its range may still stand still.
+                // A joint beyond the end of its range may stay at rest there.
                 (joints.upper_limits(at).map(|max| max.max(0.0)), joints.lower_limits(at).map(|min| min.min(0.0)))
             }
         };

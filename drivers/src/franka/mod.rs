@@ -3,18 +3,19 @@
 //!
 //! * `session` connects, and `state` decodes. `arm` reads on its own thread and commands nothing. `realtime` requests
 //!   real-time scheduling for it, and `statistics` measures delays and losses.
-//! * `movable` is an arm that may be moved. Orders pass through `mailbox` to `motion_loop`, which runs on the reading
+//! * `movable` is an arm that may be moved. Commands pass through `mailbox` to `motion_loop`, which runs on the reading
 //!   thread. `reference` tracks the robot's commanded joint positions, `limits` has the motion limits, and `request`
 //!   encodes requests.
-//! * `emulated` is an emulated controller for tests and simulators.
+//! * `emulated` is an emulated controller for tests and simulators, behind the feature `emulation`.
 //!
-//! Motions use the crate's wire structs instead of its `Robot`, which waits for answers without a time limit, does
-//! not expose the datagrams, so that lost and late ones cannot be counted, and prints to the terminal.
+//! Motions use the wire structs of `franka-rs` instead of its `Robot`. `Robot` waits for answers without a time limit,
+//! prints to the terminal, and does not expose the datagrams, so lost and late ones could not be counted.
 //!
 //! Sizes, numbers and layouts of messages are those of the crate `franka-rs`, which follows libfranka 0.21.2 (FCI 10,
 //! FR3) and 0.9.2 (FCI 5, Panda).
 
 mod arm;
+#[cfg(feature = "emulation")]
 pub mod emulated;
 mod limits;
 mod mailbox;

@@ -1,5 +1,5 @@
-//! The part of an arm's thread that moves it: for each state that arrives, it sends the joint positions for the next
-//! millisecond.
+//! The part of an arm's thread that moves the arm: for each state that arrives, it sends the joint positions for the
+//! next millisecond.
 
 use super::limits::RobotLimits;
 use super::mailbox::{MotionCommand, MotionMailbox};
@@ -42,7 +42,8 @@ pub(super) struct StampedState<'a> {
     pub(super) numbered: &'a NumberedState,
     pub(super) stamp: Stamp,
     pub(super) from: SocketAddr,
-    /// Whether it has just arrived. Otherwise it may be from before the robot gave up on us, and is not answered.
+    /// Whether the state has just arrived. If not, the robot may already have stopped waiting for an answer, so the
+    /// state is not answered.
     pub(super) is_fresh: bool,
 }
 
@@ -55,7 +56,7 @@ enum MotionState {
         n_waited: u32,
     },
     ActiveMotion(Box<ActiveMotion>),
-    /// A motion has ended according to the states; the robot's reply is still to come.
+    /// A motion has ended according to the states, but the robot's reply has not arrived yet.
     Ending {
         id: u32,
         n_waited: u32,
@@ -70,7 +71,7 @@ struct ActiveMotion {
     reference: Reference,
     /// Number of the newest state.
     number: u64,
-    /// The position sent in answer to it.
+    /// The position sent in answer to the newest state.
     sent: Option<[f64; super::N_JOINTS]>,
     n_cycles: u64,
     n_at_rest: u32,
@@ -114,8 +115,8 @@ impl MotionLoop {
         self.stop_because(format!("connection lost: {reason}"));
     }
 
-    /// Records the robot's mode, and reports one that stops the arm outside of a motion. During a motion, its end
-    /// gives more details.
+    /// Records the robot's mode. Outside of a motion, also reports a mode that stops the arm. During a motion, the
+    /// reply about the end of the motion gives more details.
     pub(super) fn take_mode(&mut self, state: &RobotState) {
         let mode = state.robot_mode;
         if mode == self.mode {
@@ -227,7 +228,7 @@ impl MotionLoop {
             Some(MotionCommand::Stop) => generator.stop(),
             None => {}
         }
-        // At rest the robot stays where it is, even if commands were lost.
+        // At rest, the robot keeps its position even if commands were lost.
         if fate != CommandFate::Followed && !generator.is_at_rest() {
             generator.resume(&reference.setpoint())?;
         }
@@ -249,7 +250,7 @@ impl MotionLoop {
                 active.sent = Some(position_rad);
                 self.mailbox.lock().statistics.count(clock::now().duration_since(stamped.stamp));
             }
-            // Like a lost datagram: the robot extrapolates without it.
+            // This has the same effect as a lost datagram: the robot extrapolates.
             Err(error) => log::debug!("{}: a command could not be sent: {}", self.device, error_text(&error)),
         }
     }
@@ -282,7 +283,7 @@ impl MotionLoop {
         self.finish(reason)
     }
 
-    /// No motion is active any more. A reason means that it stopped because of a problem.
+    /// Ends the motion. A `reason` means that it stopped because of a problem.
     fn finish(&self, reason: Option<String>) -> MotionState {
         match reason {
             Some(reason) => self.stop_because(reason),
@@ -304,7 +305,7 @@ impl MotionLoop {
     }
 }
 
-/// Why a robot does not follow commands, according to its state; `None` if it is ready.
+/// The reason why a robot does not follow commands, according to its state; `None` if the robot is ready.
 fn cause(state: &RobotState) -> Option<String> {
     match state.robot_mode {
         RobotMode::Reflex => {

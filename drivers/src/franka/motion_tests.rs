@@ -60,7 +60,7 @@ fn settle(arm: &MovableFrankaArm) -> Result<(), String> {
 
 /// Performs an action and waits until the arm is at rest.
 ///
-/// On a machine so busy that the arm's thread is not woken for 20 ms, the robot triggers a reflex, as it should; the
+/// If the machine is so busy that the arm's thread is not woken for 20 ms, the robot correctly triggers a reflex. The
 /// action is then retried.
 fn retry_until_settled(arm: &mut MovableFrankaArm, mut act: impl FnMut(&mut MovableFrankaArm) -> Result<(), String>) {
     const MAX_ATTEMPTS: usize = 5;
@@ -374,7 +374,7 @@ fn disconnect_triggers_reflex_and_arm_recovers() {
     assert!(arm.command(&far).is_err(), "the arm has not been recovered");
     arm.recover().unwrap();
     move_and_settle(&mut arm, &far);
-    // Permanent this time.
+    // This time, the disconnection is permanent.
     relay.faults.is_disconnected.store(true, Ordering::Relaxed);
     let deadline = Instant::now() + TEST_TIMEOUT;
     while !matches!(arm.motion(), Motion::Stopped { .. }) {

@@ -1,4 +1,4 @@
-//! A movable arm. A motion starts with the first target and ends a second after the arm came to rest.
+//! A movable arm. A motion starts with the first target and ends one second after the arm has come to rest.
 
 use super::limits::{RobotLimits, clamp_to_range};
 use super::mailbox::{MailboxState, MotionCommand, MotionMailbox};
@@ -20,11 +20,11 @@ const STOP_TIMEOUT: Duration = Duration::from_secs(5);
 /// Maximum time until the states agree with the robot's reply.
 const SETTLE_TIMEOUT: Duration = Duration::from_secs(2);
 
-/// A Franka arm that is moved by joint positions, under the robot's own joint impedance controller.
+/// A Franka arm that is moved by joint positions, under the joint impedance controller of the robot.
 ///
-/// A motion of the robot lasts from the first target until the arm has been at rest for a second. Between motions the
-/// robot holds the arm, and a person may guide it by hand. Dropping this brings the arm to rest and frees the robot's
-/// interface.
+/// A motion of the robot lasts from the first target until the arm has been at rest for a second. Between motions, the
+/// robot holds the arm, and a person may guide it by hand. Dropping this value brings the arm to rest and frees the
+/// robot's interface.
 #[derive(Debug)]
 pub struct MovableFrankaArm {
     address: String,
@@ -37,7 +37,7 @@ pub struct MovableFrankaArm {
 }
 
 impl MovableFrankaArm {
-    /// Checks what can be checked without the robot. The error is the reason why the arm cannot be moved as
+    /// Makes the checks that need no connection to the robot. The error is the reason why the arm cannot be moved as
     /// configured.
     pub fn check(motion: &MotionConfig) -> Result<(), String> {
         if motion.on_loss != OnLoss::Hold {
@@ -54,7 +54,8 @@ impl MovableFrankaArm {
         Ok(())
     }
 
-    /// Connects like [`FrankaArm::open`], and prepares to move. Nothing moves or is set before the first target.
+    /// Connects like [`FrankaArm::open`], and prepares to move. Nothing moves, and no setting of the robot changes,
+    /// before the first target.
     ///
     /// `motion.limits` are in the order of the joints. They are reduced to at most half of the robot's limits (an
     /// eighth for the jerk), and to slightly less than its joint ranges. A Franka arm always brakes and holds after
@@ -128,7 +129,7 @@ impl MovableFrankaArm {
     }
 }
 
-/// Why an arm accepts no target.
+/// The reason why an arm accepts no target.
 fn refusal(mailbox_state: &MailboxState) -> Option<String> {
     match &mailbox_state.motion {
         Motion::Stopped { reason } => Some(format!("it accepts no target before it is recovered: {reason}")),
@@ -176,8 +177,8 @@ impl MovableArm for MovableFrankaArm {
         Ok(())
     }
 
-    /// Clears the reflex, if one stopped the arm. A user stop or locked joints must be released by a person first;
-    /// the error names the cause.
+    /// Clears the reflex, if a reflex stopped the arm. A person must first release a user stop or locked joints; the
+    /// error names the cause.
     fn recover(&mut self) -> Result<(), Error> {
         let Some(mailbox_state) =
             self.mailbox.wait(STOP_TIMEOUT, |mailbox_state| mailbox_state.is_idle || mailbox_state.is_lost)

@@ -3,7 +3,7 @@
 use franka::realtime::set_current_thread_scheduler_priority;
 use rustix::mm::{MlockAllFlags, mlockall};
 
-/// Above all ordinary threads and interrupt threads (50), below the kernel's watchdogs (99).
+/// Real-time priority: above all ordinary threads and interrupt threads (50), below the kernel's watchdogs (99).
 const PRIORITY: i32 = 80;
 
 /// Gives the calling thread a real-time priority, and locks the memory that the program currently uses.

@@ -6,10 +6,10 @@ use franka::{RobotState, rate_limiting};
 
 /// Seconds between commands.
 const STEP_SECS: f64 = rate_limiting::DELTA_T;
-/// Maximum difference between our reference and the robot's, in rad. Smaller ones are rounding of FCI 10, up to 8
-/// rad.
+/// Maximum position difference between our reference and the robot's, in rad. Smaller differences come from the
+/// rounding of FCI 10, for positions up to 8 rad.
 const POSITION_TOLERANCE_RAD: f64 = 4e-7;
-/// The same for velocities, up to 8 rad/s.
+/// Maximum velocity difference between our reference and the robot's, for velocities up to 8 rad/s.
 const VELOCITY_TOLERANCE_RAD_S: f64 = 1e-6;
 /// Maximum number of steps by which a reported reference may be behind: `franka-sim` reports what its joint thread
 /// has processed.
@@ -30,7 +30,7 @@ pub(super) struct Reference {
 /// Outcome of a command, according to the states after it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum CommandFate {
-    /// The robot followed it.
+    /// The robot followed the command.
     Followed,
     /// The robot extrapolated over this many missing commands.
     Missed(u64),
@@ -39,7 +39,7 @@ pub(super) enum CommandFate {
 }
 
 impl Reference {
-    /// A reference at rest at the position that the robot reports as commanded.
+    /// A reference at rest, at the commanded position that the robot reports.
     pub(super) fn at_rest(state: &RobotState) -> Self {
         Self { position_rad: state.q_d, velocity_rad_s: [0.0; N_JOINTS], acceleration_rad_s2: [0.0; N_JOINTS] }
     }
@@ -71,9 +71,9 @@ impl Reference {
     /// that command.
     ///
     /// Keeps our own numbers if they match the robot's up to rounding, because differences of rounded numbers are
-    /// inaccurate. If the effect of a missing command is within that rounding, the reported velocities decide: it
-    /// shows in them a thousand times more clearly. Velocities that still match the earlier reference prove nothing:
-    /// `franka-sim` reports those of its joints, which start to move some time after their target does.
+    /// inaccurate. If the effect of a missing command is within that rounding, the reported velocities decide, because
+    /// the effect on them is a thousand times larger. Velocities that still match the earlier reference prove nothing:
+    /// `franka-sim` reports the velocities of its joints, which start to move some time after their target.
     pub(super) fn advance(
         &self,
         sent: Option<[f64; N_JOINTS]>,
@@ -181,7 +181,7 @@ mod tests {
         assert!((followed.position_rad[0] - missed.position_rad[0]).abs() < POSITION_TOLERANCE_RAD);
         assert_eq!(reference.advance(Some(next), 1, &state(&missed)), (missed, CommandFate::Missed(1)));
         assert_eq!(reference.advance(Some(next), 1, &state(&followed)), (followed, CommandFate::Followed));
-        // A robot whose velocities match neither prediction counts as following, according to its position.
+        // If the velocities of a robot match neither prediction, its position decides, and it counts as following.
         let mut smoothed = followed;
         smoothed.velocity_rad_s = [0.29; N_JOINTS];
         assert_eq!(reference.advance(Some(next), 1, &state(&smoothed)), (followed, CommandFate::Followed));

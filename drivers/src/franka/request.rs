@@ -13,18 +13,18 @@ use zerocopy::little_endian::U64;
 const MAX_ANSWER: Duration = Duration::from_secs(2);
 /// Maximum time for a recovery, which releases brakes.
 const MAX_RECOVERY: Duration = Duration::from_secs(10);
-/// Maximum deviation of a motion from the command: m, rad, and rad of the elbow. As in libfranka, this allows
-/// anything.
+/// Maximum deviation of a motion from the command: m, rad, and rad of the elbow. As in libfranka, these values allow
+/// any deviation.
 const ANY_DEVIATION: (f64, f64, f64) = (10.0, 3.12, std::f64::consts::TAU);
 
 /// Collision thresholds and stiffness of a robot.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ContactConfig {
-    /// External torques at which it stops, Nm, from the base to the flange.
+    /// External torques at which the robot stops, Nm, from the base to the flange.
     pub torque_nm: [f64; N_JOINTS],
-    /// External forces at its end effector at which it stops, along x, y and z of its base, N.
+    /// External forces on the end effector at which the robot stops, along x, y and z of its base, N.
     pub force_n: [f64; 3],
-    /// External moments at which it stops, about the same axes, Nm.
+    /// External moments about the same axes at which the robot stops, Nm.
     pub moment_nm: [f64; 3],
     /// Stiffness of its joints, Nm/rad; `None` leaves it unchanged.
     pub stiffness_nm_rad: Option<[f64; N_JOINTS]>,
@@ -121,7 +121,7 @@ pub(super) fn halt(session: &Session) -> Result<(), String> {
     send(session, v10::Command::StopMove.to_u32(), &[]).map(drop)
 }
 
-/// Outcome of a motion, if the robot has reported it.
+/// Result of a motion, if the robot has reported it.
 pub(super) fn outcome(session: &Session, id: u32) -> Result<Option<MotionResponse>, String> {
     let message = session.network.tcp.try_receive_response(id).map_err(|error| error_text(&error))?;
     Ok(message.map(|message| decode_response(session.version, message_payload(HeaderLayout::Robot, &message))))
@@ -158,7 +158,7 @@ pub(super) fn command(version: FciVersion, number: u64, position_rad: &[f64; N_J
     }
 }
 
-/// Why a robot in this mode accepts no motion, and what to do; `None` if it is ready.
+/// The reason why a robot in this mode accepts no motion, and the remedy; `None` if the robot is ready.
 pub(super) fn blocking_reason(mode: RobotMode) -> Option<&'static str> {
     match mode {
         RobotMode::Idle => None,

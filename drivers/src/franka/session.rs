@@ -16,7 +16,7 @@ const POLL_INTERVAL: Duration = Duration::from_millis(1);
 const ONE_CLIENT_HINT: &str = "FCI accepts one client at a time: stop the other one, or let it send the joint states and set \
                           arm.driver = \"udp\" (docs/reference/udp.md)";
 
-/// An open connection. Dropping it closes it.
+/// An open connection. Dropping it closes the connection.
 #[derive(Debug)]
 pub(super) struct Session {
     pub(super) network: Network,
@@ -30,7 +30,7 @@ enum ConnectResponse {
 }
 
 impl Session {
-    /// Connects with FCI 10, or with FCI 5 if the controller uses that.
+    /// Connects with FCI 10, or with FCI 5 if the controller uses that version.
     pub(super) fn open(address: &str) -> Result<Self, Error> {
         let fault = |reason| Error::Fci { address: address.to_owned(), reason };
         let connect = |version: FciVersion| connect(address, number(version)).map_err(fault);

@@ -7,7 +7,7 @@ use zerocopy::FromBytes;
 
 /// One byte more than the longest state, so that datagrams that are too long are detected.
 pub(super) const MAX_STATE_BYTES: usize = size_of::<v5::RobotState>() + 1;
-/// Maximum angle of any joint; larger numbers are invalid.
+/// Maximum angle of any joint. States with larger angles are invalid.
 const MAX_RAD: f64 = 10.0;
 
 /// A state with its number, which increases by one per millisecond of the robot's clock.
@@ -45,10 +45,4 @@ pub(super) fn decode(version: FciVersion, bytes: &[u8]) -> Option<NumberedState>
 /// Decodes a pose from a 4x4 matrix in column-major order.
 pub(super) fn pose(columns: &[f64; 16]) -> Result<Transform, kinematics::Error> {
     transform::from_rows(&std::array::from_fn(|at| columns[(at % 4) * 4 + at / 4]))
-}
-
-/// Matrix of a pose in column-major order.
-pub(super) fn columns(pose: &Transform) -> [f64; 16] {
-    let rows = transform::to_rows(pose);
-    std::array::from_fn(|at| rows[(at % 4) * 4 + at / 4])
 }

@@ -26,7 +26,7 @@ pub struct StateStatistics {
 }
 
 impl StateStatistics {
-    /// Fraction of the robot's states that were received in order, 0 to 1; 1 before the first.
+    /// Fraction of the robot's states that were received in order, 0 to 1; 1 before the first state.
     pub fn success_frac(&self) -> f64 {
         match self.n_received + self.n_lost {
             0 => 1.0,
@@ -77,7 +77,7 @@ pub struct MotionStatistics {
     pub n_motions: u64,
     /// States that arrived during motions.
     pub n_cycles: u64,
-    /// States of these that were answered with a command.
+    /// Number of those states that were answered with a command.
     pub n_answered: u64,
     /// States that arrived too late to be answered: the robot had already extrapolated.
     pub n_stale: u64,
@@ -85,7 +85,7 @@ pub struct MotionStatistics {
     pub n_lost: u64,
     /// Commands that the robot missed, according to its reported reference. With a small jerk this is not detectable.
     pub n_missed: u64,
-    /// Commands that were changed to keep the robot's own limits.
+    /// Commands that were changed to stay within the limits of the robot.
     pub n_limited: u64,
     delays: Delays,
     reported_success: ReportedSuccess,
@@ -100,7 +100,7 @@ struct ReportedSuccess {
 }
 
 impl MotionStatistics {
-    /// Fraction of the robot's states during motions that were answered, 0 to 1; 1 before the first.
+    /// Fraction of the robot's states during motions that were answered, 0 to 1; 1 before the first motion.
     pub fn success_frac(&self) -> f64 {
         match self.n_cycles + self.n_lost {
             0 => 1.0,
@@ -108,8 +108,8 @@ impl MotionStatistics {
         }
     }
 
-    /// The robot's own `control_command_success_rate`, 0 to 1: the mean, and the minimum over any 100 consecutive
-    /// commands. `None` if no motion was long enough.
+    /// The `control_command_success_rate` that the robot reports, 0 to 1: the mean, and the minimum over any 100
+    /// consecutive commands. `None` if no motion was long enough.
     pub fn robot_success_frac(&self) -> Option<[f64; 2]> {
         let ReportedSuccess { n, sum_frac, min_frac } = self.reported_success;
         (n > 0).then(|| [sum_frac / n as f64, min_frac])

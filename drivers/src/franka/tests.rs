@@ -13,7 +13,7 @@ use std::time::{Duration, Instant};
 
 const URDF: &str = include_str!("../../../kinematics/tests/data/panda.urdf");
 pub(super) const FREE_PORT: &str = "127.0.0.1:0";
-/// Long, because a busy machine may be slow. A successful test does not wait this long.
+/// Timeout of the tests. It is long because a busy machine may be slow; a successful test does not wait this long.
 pub(super) const TEST_TIMEOUT: Duration = Duration::from_secs(20);
 pub(super) const REST_RAD: [f64; N_JOINTS] = [0.1, -0.5, 0.2, -2.0, 0.3, 1.8, 0.7];
 pub(super) const VERSIONS: [FciVersion; 2] = [FciVersion::V5, FciVersion::V10];
@@ -170,7 +170,7 @@ fn quintic(frac: f64, by_rad: f64) -> f64 {
 
 /// Moves the fourth joint with franka-rs, which implements libfranka's loop, without its limits and filters.
 ///
-/// On a machine so busy that the client is not woken for 20 ms, the robot triggers a reflex, as it should; the motion
+/// If the machine is so busy that the client is not woken for 20 ms, the robot correctly triggers a reflex. The motion
 /// is then retried.
 fn move_to(client: &Robot, goal_rad: f64, secs: f64) -> Result<(), FrankaError> {
     const MAX_ATTEMPTS: usize = 5;

@@ -1,4 +1,4 @@
-//! Fuzz targets for dataset lists. The images they refer to are valid.
+//! Fuzz targets for dataset lists. The images to which the lists refer are valid.
 
 use super::scratch::Scratch;
 use crate::dataset;

@@ -5,7 +5,7 @@ use crate::Source;
 use crate::recording::Recording;
 
 thread_local! {
-    /// Contains one file, which is rewritten for each input.
+    /// Folder with one file, which is rewritten for each input.
     static FOLDER: Scratch = Scratch::new("recording");
 }
 

@@ -19,7 +19,7 @@ pub struct Seed {
     pub bytes: Vec<u8>,
 }
 
-/// The seeds that are created by code; others were found by fuzzing.
+/// Returns the seeds that are created by code. The other seeds were found by fuzzing.
 pub fn generated_seeds() -> Vec<Seed> {
     let seed = |target, name, bytes| Seed { target, name, bytes };
     let mut seeds = vec![

@@ -10,8 +10,8 @@ use rsruckig::prelude::{
 };
 use std::time::Duration;
 
-/// How far outside its range a joint may be, radians or meters. Causes are backlash, an encoder offset, or a motion
-/// that continued without us and is too fast to stop before the end of the range.
+/// Maximum distance by which a joint may be outside its range, radians or meters. Causes are backlash, an encoder
+/// offset, or a motion that continued without commands and is too fast to stop before the end of the range.
 const MAX_OVERSHOOT: f64 = 0.02;
 
 /// Fractions by which the jerk is reduced if no trajectory is found with the full jerk.
@@ -103,8 +103,8 @@ impl TrajectoryGenerator {
         }
     }
 
-    /// Continues towards the target from a different state of motion, for use if the arm's reference was found to be
-    /// elsewhere.
+    /// Continues towards the target from a different state of motion. Use it if the reference of the arm differs from
+    /// the last setpoint.
     pub fn resume(&mut self, from: &Setpoint) -> Result<(), String> {
         for values in [&from.position, &from.velocity, &from.acceleration] {
             check(values, self.limits.len())?;
@@ -173,7 +173,7 @@ impl TrajectoryGenerator {
             self.output.pass_to_input(&mut self.input);
             if result == RuckigResult::Finished {
                 self.is_at_rest = true;
-                // The end is reached up to a rounding error; remove the remaining motion.
+                // The end is reached up to a rounding error, so the remaining motion is removed.
                 self.input.current_velocity = data_array(self.limits.iter().map(|_| 0.0));
                 self.input.current_acceleration = data_array(self.limits.iter().map(|_| 0.0));
             }

@@ -18,13 +18,14 @@ pub struct JointTarget {
 /// Motion state of a movable arm.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Motion {
-    /// The arm holds its last commanded position, or the one at which it was found.
+    /// The arm holds its last commanded position or, before the first command, its initial position.
     Holding,
     /// The arm is moving to its target.
     Moving,
-    /// The arm stopped because of a fault or was lost. It accepts no target before [`MovableArm::recover`].
+    /// The arm stopped because of a fault, or the connection to it was lost. It accepts no target before
+    /// [`MovableArm::recover`].
     Stopped {
-        /// Why it stopped.
+        /// The reason for the stop.
         reason: String,
     },
 }
@@ -35,7 +36,7 @@ pub enum Motion {
 /// trait object may move the arm; programs that only read use an [`Arm`].
 pub trait MovableArm: Arm {
     /// Moves to a target from any position and state of motion, within the limits of [`MotionConfig`]. A later target
-    /// replaces it.
+    /// replaces this one.
     ///
     /// Returns the accepted target, clamped to the joints' ranges.
     ///
@@ -52,7 +53,7 @@ pub trait MovableArm: Arm {
     fn recover(&mut self) -> Result<(), Error>;
 }
 
-/// What motors do when commands from this computer stop.
+/// Action of the motors when commands from this computer stop.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum OnLoss {
     /// Stop and hold their positions.
@@ -79,9 +80,9 @@ impl OnLoss {
 pub struct MotionConfig {
     /// Limits of each joint.
     pub limits: Vec<MotionLimits>,
-    /// What motors are configured to do when commands stop. An arm that does not support it is not moved.
+    /// Action of the motors when commands stop. An arm that does not support it is not moved.
     pub on_loss: OnLoss,
-    /// Time without commands after which they do it.
+    /// Time without commands after which the motors take this action.
     pub timeout: Duration,
     /// Whether to move motors that cannot detect missing commands.
     pub accept_no_watchdog: bool,

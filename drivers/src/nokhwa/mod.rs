@@ -2,14 +2,13 @@
 //!
 //! A call for an image may never return and cannot be canceled. `worker.rs` therefore calls nokhwa on a separate
 //! thread. `camera.rs` monitors the thread, abandons it if it hangs, and starts a new one. Images are the unmodified
-//! bytes of the device. They have no sequence numbers, so `gap_estimator.rs` estimates the number of dropped images
-//! from stamps.
+//! bytes of the device. They have no sequence numbers, so the number of dropped images is estimated from
+//! stamps (`gap_estimator.rs` of the crate).
 
 mod camera;
-mod gap_estimator;
 mod worker;
 
-pub use camera::{Counts, NokhwaCamera};
+pub use camera::NokhwaCamera;
 
 use crate::v4l2::{Delivery, V4l2Format};
 use kinematics::Intrinsics;
@@ -28,11 +27,11 @@ pub struct Config {
     pub intrinsics: Intrinsics,
     /// Images per second, an integer.
     pub rate_hz: f64,
-    /// Exposure time of each image, microseconds, if known. The camera is not configured with it.
+    /// Exposure time of each image, microseconds, if known. The driver does not set it on the camera.
     pub exposure_micros: Option<f64>,
-    /// Which image the next call returns if the caller is slow.
+    /// Selects the image that the next call returns if the caller is slow.
     pub delivery: Delivery,
-    /// How long to try to reconnect to a camera.
+    /// Maximum time for reconnecting to a camera.
     pub reconnect_for: Duration,
 }
 
@@ -82,7 +81,7 @@ pub enum Problem {
         /// Time spent waiting.
         waited: Duration,
     },
-    /// Too many calls hang to start another one.
+    /// So many calls hang that no further call is started.
     #[error("{n_abandoned_threads} calls hang: reconnect the camera, or restart the program")]
     TooManyAbandoned {
         /// Number of calls that hang.

@@ -42,7 +42,7 @@ pub(super) struct Frame {
     pub(super) bytes: Vec<u8>,
 }
 
-/// A streaming thread. After this is dropped, the thread ends as soon as its current call returns.
+/// A streaming thread.
 #[derive(Debug)]
 pub(super) struct Worker {
     shared: Arc<Shared>,
@@ -58,7 +58,7 @@ struct Shared {
 #[derive(Default)]
 struct State {
     queue: VecDeque<WorkerEvent>,
-    /// The caller has dropped the worker.
+    /// Whether the caller has stopped the worker.
     stop: bool,
 }
 
@@ -99,21 +99,23 @@ impl Worker {
             self.shared.arrived.wait_for(&mut state, remaining);
         }
     }
-}
 
-impl Drop for Worker {
-    fn drop(&mut self) {
+    /// Ends the thread as soon as its current call returns.
+    pub(super) fn stop(&self) {
         self.shared.state.lock().stop = true;
     }
 }
 
 impl Shared {
     /// Queues an event and returns whether the caller is still listening. If the queue is full, the oldest image is
-    /// dropped; the gap is detected from the stamps.
+    /// dropped; the gap is detected from the stamps. Other events are kept: without them, the caller would never learn
+    /// that the camera is open.
     fn send(&self, event: WorkerEvent) -> bool {
         let mut state = self.state.lock();
-        if state.queue.len() >= MAX_WAITING {
-            state.queue.pop_front();
+        if state.queue.len() >= MAX_WAITING
+            && let Some(ix) = state.queue.iter().position(|queued| matches!(queued, WorkerEvent::Frame(_)))
+        {
+            state.queue.remove(ix);
         }
         state.queue.push_back(event);
         self.arrived.notify_all();
@@ -138,13 +140,13 @@ fn stream(config: &Config, shared: &Shared) -> Result<(), Problem> {
     Ok(())
 }
 
-/// Finds the camera by name. Numbers change with every connection, so this is repeated each time.
+/// Finds the camera by name. This is repeated for every connection, because the numbers of cameras may change.
 fn find(device: &str) -> Result<CameraIndex, Problem> {
     if let Some(index) = number(device) {
         return Ok(CameraIndex::Index(index));
     }
     let mut cameras = nokhwa::query(ApiBackend::Auto).unwrap_or_default();
-    // Some cameras have several nodes: the first one is for images.
+    // Some cameras have several nodes; the first one delivers images.
     cameras.sort_by_key(|camera| camera.index().as_index().unwrap_or(u32::MAX));
     let is_exact_match = |camera: &&CameraInfo| camera.human_name() == device;
     let is_partial_match = |camera: &&CameraInfo| !device.is_empty() && camera.human_name().contains(device);
@@ -168,7 +170,7 @@ fn number(device: &str) -> Option<u32> {
     node.strip_prefix("/dev/video").unwrap_or(node).parse().ok()
 }
 
-/// Opens the camera in the requested format, or in the first one it supports.
+/// Opens the camera in the requested format, or else in the first format that it supports.
 fn open(config: &Config, index: CameraIndex) -> Result<(Camera, V4l2Format), Problem> {
     let rate_hz = config.rate_hz;
     #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "compared with the original below")]

@@ -10,11 +10,11 @@ pub struct Config {
     pub name: String,
     /// Serial number; if empty, the only connected camera is used.
     pub serial: String,
-    /// Recorded file to play back in place of a camera.
+    /// Recorded file to play back instead of a camera.
     pub file: Option<PathBuf>,
     /// Timing of images played back from a file.
     pub pace: Pace,
-    /// With [`Pace::Clock`]: offset added to the stamps of the file, nanoseconds.
+    /// Offset added to the stamps of the file, nanoseconds; used only with [`Pace::Clock`].
     pub clock_offset_nanos: i64,
     /// Stream of the images that are not depth.
     pub stream: Stream,
@@ -28,11 +28,11 @@ pub struct Config {
     pub settings: Settings,
     /// Depth filters of the library, in order.
     pub filters: Vec<Filter>,
-    /// How long to try to reconnect to a camera.
+    /// Maximum time for reconnecting to a camera.
     pub reconnect_for: Duration,
 }
 
-/// When images of a file are delivered, and the clock of their stamps.
+/// Delivery times of the images of a file, and the clock of their stamps.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Pace {
     /// Like a live camera: the first image comes immediately and is stamped on arrival. Later images follow at the
@@ -41,8 +41,9 @@ pub enum Pace {
     RealTime,
     /// As fast as the caller takes them, with the stamps of the file.
     Fast,
-    /// Stamps are those of the file plus [`Config::clock_offset_nanos`], on the monotonic clock of this computer, and
-    /// each image is delivered at that time. For simulations that emulate other devices in parallel with the file.
+    /// Stamps are those of the file plus [`Config::clock_offset_nanos`], on the monotonic clock of this computer. Each
+    /// image is delivered at the time of its stamp. Used by simulations that emulate other devices in parallel with the
+    /// file.
     Clock,
 }
 
@@ -52,7 +53,7 @@ pub enum Stream {
     /// The color camera.
     #[default]
     Color,
-    /// The left infrared camera (D4xx) or the only one. Depth is in its frame.
+    /// The only infrared camera, or the left one (D4xx). Depth is in its frame.
     Infrared,
 }
 
@@ -67,7 +68,7 @@ pub struct Settings {
     pub white_balance_kelvin: Option<i32>,
     /// Brightness, in units of the camera.
     pub brightness: Option<i32>,
-    /// Preset of the depth camera, by the name that the camera uses.
+    /// Name of a preset of the depth camera.
     pub preset: Option<String>,
     /// Power of the projector or laser, in units of the camera (D4xx: milliwatts); 0 turns it off.
     pub laser_power: Option<f64>,

@@ -36,7 +36,7 @@ impl FoundCamera {
         self.usb.as_deref().is_some_and(|usb| usb.starts_with('2') || usb.starts_with('1'))
     }
 
-    /// Whether its firmware is older than the library recommends.
+    /// Whether its firmware is older than the version that the library recommends.
     pub fn has_old_firmware(&self) -> bool {
         let numbers = |version: &str| version.split('.').map(|part| part.parse().unwrap_or(0)).collect::<Vec<u32>>();
         self.recommended_firmware.as_deref().is_some_and(|requested| numbers(&self.firmware) < numbers(requested))

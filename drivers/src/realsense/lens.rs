@@ -50,7 +50,8 @@ pub(super) fn intrinsics(raw: &sys::rs2_intrinsics, stream: &'static str) -> Res
     Ok(intrinsics)
 }
 
-/// Converts our intrinsics to those of the library, which has the same models.
+/// Converts our intrinsics to those of the library, which supports the same models.
+#[cfg(feature = "emulation")]
 pub(super) fn raw(intrinsics: &Intrinsics) -> sys::rs2_intrinsics {
     let lens = if intrinsics.is_pinhole() { Lens::Pinhole } else { intrinsics.lens };
     let (model, k) = match lens {
@@ -76,6 +77,7 @@ pub(super) fn transform(raw: &sys::rs2_extrinsics) -> Transform {
 }
 
 /// Converts a transform to extrinsics of the library.
+#[cfg(feature = "emulation")]
 pub(super) fn extrinsics(transform: &Transform) -> sys::rs2_extrinsics {
     let rotation = transform.rotation.to_rotation_matrix();
     let mut columns = [0.0; 9];
@@ -84,6 +86,7 @@ pub(super) fn extrinsics(transform: &Transform) -> sys::rs2_extrinsics {
     sys::rs2_extrinsics { rotation: columns, translation: translation.map(narrow) }
 }
 
+#[cfg(feature = "emulation")]
 #[expect(clippy::cast_possible_truncation, reason = "the library uses single precision")]
 fn narrow(number: f64) -> f32 {
     number as f32

@@ -4,14 +4,14 @@
 //! `realsense`. `sdk.rs` wraps the part of the library that `realsense-rust` lacks; `find.rs` lists cameras; `lens.rs`
 //! and `stamps.rs` convert lens parameters and time stamps; `options.rs` applies settings; `streams.rs` selects and
 //! opens streams; `filters.rs` filters depth; `session.rs` converts frames to images; `camera.rs` handles
-//! disconnections. `emulated/` writes the files of an emulated camera.
+//! disconnections. `emulated/` writes the files of an emulated camera (cargo feature `emulation`).
 
 mod config;
 mod problem;
 
 #[cfg(feature = "realsense")]
 mod camera;
-#[cfg(feature = "realsense")]
+#[cfg(all(feature = "emulation", feature = "realsense"))]
 pub mod emulated;
 #[cfg(feature = "realsense")]
 mod filters;
@@ -31,7 +31,7 @@ mod stamps;
 mod streams;
 
 #[cfg(feature = "realsense")]
-pub use camera::{Counts, RealsenseCamera};
+pub use camera::RealsenseCamera;
 pub use config::{Config, Filter, Pace, Settings, Stream};
 #[cfg(feature = "realsense")]
 pub use find::{FoundCamera, cameras};

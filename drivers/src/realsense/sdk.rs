@@ -156,6 +156,7 @@ impl Device {
     }
 
     /// Pointer for other calls, valid while this device is alive.
+    #[cfg(feature = "emulation")]
     pub(super) fn as_ptr(&self) -> *mut sys::rs2_device {
         self.raw.as_ptr()
     }
@@ -190,7 +191,7 @@ impl Device {
 /// One sensor of a device, with its streams and options.
 pub(super) struct Sensor {
     raw: NonNull<sys::rs2_sensor>,
-    /// The same sensor. This does not own it.
+    /// Options of the same sensor. This field does not own the sensor.
     pub(super) options: Options,
 }
 
@@ -349,8 +350,8 @@ impl Mode {
     }
 }
 
-/// Queued images of all streams, in order of arrival. If the queue is full, the oldest image is dropped, except that a
-/// file waits.
+/// Queued images of all streams, in order of arrival. If the queue is full, a file waits, and a camera drops the oldest
+/// image.
 #[derive(Debug)]
 pub(super) struct Queue(NonNull<sys::rs2_frame_queue>);
 
@@ -391,6 +392,7 @@ impl Queue {
 
 impl Queue {
     /// Frees all queued images.
+    #[cfg(feature = "emulation")]
     pub(super) fn empty(&self) -> Result<(), Problem> {
         loop {
             let mut frame = null_mut();

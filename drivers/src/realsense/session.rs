@@ -32,14 +32,14 @@ pub(super) struct Session {
     stamps: Stamps,
     filters: Filters,
     counter: [FrameCounter; 2],
-    /// Files only: an image that was read but is not due yet.
+    /// For files only: an image that was read but is not due yet.
     pending: Option<Image>,
     image_secs_per_count: f64,
     is_file: bool,
     started_at: Instant,
     last_image: Instant,
-    n_images: u64,
-    /// Files only: number of images that were due before the file was opened.
+    has_image: bool,
+    /// For files only: number of images that were due before the file was opened.
     n_before_open: u64,
     description: String,
     started: ActiveStreams,
@@ -96,7 +96,7 @@ impl Session {
             is_file: config.file.is_some(),
             started_at: Instant::now(),
             last_image: Instant::now(),
-            n_images: 0,
+            has_image: false,
             n_before_open: 0,
             description,
             started,
@@ -113,11 +113,6 @@ impl Session {
 
     pub(super) fn calibration(&self) -> &Calibration {
         &self.started.calibration
-    }
-
-    /// Number of images returned since the start.
-    pub(super) fn n_images(&self) -> u64 {
-        self.n_images
     }
 
     /// Time since the last image.
@@ -140,7 +135,7 @@ impl Session {
                 std::thread::sleep(remaining.min(due_in));
                 continue;
             }
-            // Checked before the queue, so that all images until then are in the queue.
+            // This is checked before the queue, so that all images read until then are in the queue.
             let has_stopped = self.is_file && self.device.has_stopped()?;
             match self.queue.wait(remaining.min(POLL))? {
                 Some(frame) => {
@@ -150,8 +145,8 @@ impl Session {
                     }
                     self.pending = image;
                 }
-                None if has_stopped && (self.n_images > 0 || self.started_at.elapsed() > MAX_STARTUP) => {
-                    self.warn_of_images_before_open("all of the");
+                None if has_stopped && (self.has_image || self.started_at.elapsed() > MAX_STARTUP) => {
+                    self.warn_of_images_before_open("all");
                     return Ok(Next::End);
                 }
                 None if remaining <= POLL => return Ok(Next::NoImage),
@@ -160,12 +155,12 @@ impl Session {
         }
     }
 
-    /// Logs once how many images of a file were due too early.
+    /// Logs once how many images of a file were due before the file was opened.
     fn warn_of_images_before_open(&mut self, which: &str) {
         let n_before_open = std::mem::take(&mut self.n_before_open);
         if n_before_open > 0 {
             log::warn!(
-                "camera {:?}: {which} images of its file ({n_before_open}) were due before it was opened and are skipped",
+                "camera {:?}: skipped {which} images of the .bag file ({n_before_open}): they were due before fieldrig opened the file",
                 self.camera
             );
         }
@@ -174,7 +169,7 @@ impl Session {
     fn deliver(&mut self, image: Image) -> Image {
         self.warn_of_images_before_open("the first");
         self.last_image = Instant::now();
-        self.n_images += 1;
+        self.has_image = true;
         image
     }
 

@@ -1,4 +1,4 @@
-//! Computes when an image of a RealSense camera was taken, on our clock.
+//! Computes the time at which an image of a RealSense camera was taken, on our clock.
 //!
 //! With metadata (a patched kernel module, or the USB backend of the library), a camera reports mid-exposure on its own
 //! clock, a 32-bit count of microseconds. The library's conversion to "global time" is switched off because our mapping
@@ -20,7 +20,7 @@ pub(super) struct FrameTime {
     pub(super) mid_exposure_micros: Option<i64>,
     /// Stamp of the library, milliseconds.
     pub(super) millis: f64,
-    /// Whether that stamp is also of the camera clock.
+    /// Whether the stamp of the library also comes from the camera clock.
     pub(super) is_device_clock: bool,
 }
 
@@ -38,13 +38,13 @@ impl FrameTime {
 #[derive(Debug)]
 pub(super) struct Stamps {
     camera: String,
-    /// Set for a file.
+    /// Pace of the playback; `None` for a camera.
     pace: Option<Pace>,
     offset_nanos: i64,
     opened: Stamp,
     micros: WrappingMicros,
     map: ClockMap,
-    /// First time in a file, nanoseconds, and when it arrived.
+    /// First time in a file, nanoseconds, and the arrival of that image.
     first: Option<(i64, Stamp)>,
     has_warned: bool,
 }
@@ -69,7 +69,7 @@ impl Stamps {
         let Some(pace) = self.pace else {
             return device_nanos.map_or(arrival, |nanos| self.map.stamp(nanos, arrival));
         };
-        // A file without camera clock still has ordered stamps of the library.
+        // A file without camera clock still has the ordered stamps of the library.
         let nanos = device_nanos.unwrap_or_else(|| nanos_of(frame_time.millis));
         match pace {
             Pace::Fast => Stamp(nanos),
@@ -154,7 +154,7 @@ mod tests {
         let begin = i64::from(u32::MAX) - 500_000;
         for image in 0..100_i64 {
             let since_micros = image * 33_333;
-            // Negative if the middle of an exposure lies before the wrap and the readout after it.
+            // The difference is negative if mid-exposure is before the wrap and the readout after it.
             let wrapped = (begin + since_micros) % (1 << 32);
             let micros = if wrapped < 20_000 { wrapped - (1 << 32) } else { wrapped };
             let late_nanos = 5_000_000 + (image % 7) * 3_000_000;

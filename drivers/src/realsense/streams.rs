@@ -18,7 +18,7 @@ const FORMATS: [(sys::rs2_format, &str, PixelFormat); 5] = [
     (sys::rs2_format_RS2_FORMAT_BGR8, "bgr", PixelFormat::Bgr8),
     (sys::rs2_format_RS2_FORMAT_Y8, "gray", PixelFormat::Gray8),
 ];
-/// Index of the left one of two infrared cameras.
+/// Index of the left of two infrared cameras.
 const LEFT: i32 = 1;
 
 /// Calibration stored in a camera.
@@ -53,7 +53,7 @@ pub(super) struct ActiveStreams {
     sensors: BTreeSet<usize>,
     /// Description of the modes for the log.
     pub(super) description: String,
-    /// The running modes point into these.
+    /// Lists of modes into which the running modes point.
     _modes: Vec<Modes>,
 }
 
@@ -74,8 +74,8 @@ impl StreamRequest {
             && self.is_of_stream(mode)
     }
 
-    /// Whether a mode belongs to this stream. Of two infrared cameras, only the left one matches, because depth is in
-    /// its frame.
+    /// Whether a mode belongs to this stream. If there are two infrared cameras, only the left one matches, because
+    /// depth is in its frame.
     fn is_of_stream(&self, mode: &Mode) -> bool {
         let is_infrared = mode.stream == sys::rs2_stream_RS2_STREAM_INFRARED;
         mode.stream == self.stream && (!is_infrared || mode.index <= LEFT)
@@ -164,7 +164,7 @@ impl ActiveStreams {
         Ok(())
     }
 
-    /// Stops the streams. `device` must be the device that they were started on.
+    /// Stops the streams. `device` must be the device on which they were started.
     pub(super) fn stop(&self, device: &Device) {
         self.sensors.iter().for_each(|sensor| device.sensors[*sensor].stop());
     }

@@ -42,7 +42,7 @@ impl Recording {
     /// Opens a recording.
     ///
     /// # Errors
-    /// If the file does not exist, is not an MCAP file, or contains no samples of ours.
+    /// If the file does not exist, is not an MCAP file, or contains no samples recorded by this program.
     pub fn open(path: &Path) -> Result<Self, Error> {
         let open = |source| Error::Open { path: path.to_owned(), source };
         let mut file = File::open(path).map_err(open)?;
@@ -78,13 +78,13 @@ impl Recording {
         self.attachments.get(name).map(Vec::as_slice)
     }
 
-    /// Names of the joints in the order of the joint states, if the recording contains them. Available from the first
-    /// sample on.
+    /// Names of the joints in the order of the joint states, if the recording contains joint states. Available from the
+    /// first sample on.
     pub fn joint_names(&self) -> Option<&[String]> {
         self.joint_names.as_deref()
     }
 
-    /// Describes the damage of the file and how much of it could be read. Available after the last sample.
+    /// Describes the damage of the file and how much could be read. Available after the last sample.
     pub fn damage(&self) -> Option<&str> {
         self.damage.as_deref()
     }

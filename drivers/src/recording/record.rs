@@ -30,11 +30,11 @@ pub(super) enum Record<'a> {
         name: &'a str,
         data: &'a [u8],
     },
-    /// Indices, statistics and records of newer writers.
+    /// Other records: indices, statistics and records of newer writers.
     Other,
 }
 
-/// Why a record cannot be decoded.
+/// The reason why a record cannot be decoded.
 #[derive(Debug, PartialEq, Eq, thiserror::Error)]
 pub(super) enum RecordError {
     #[error("a record ends inside a field")]

@@ -92,7 +92,7 @@ impl Encoding {
         }
     }
 
-    /// Our joint states in JSON.
+    /// Joint states in JSON with our schema.
     pub(super) fn joint_state() -> Self {
         Self {
             schema_name: joint_state::SCHEMA_NAME,

@@ -28,9 +28,8 @@ pub struct RecordingMetadata<'a> {
     pub joint_names: &'a [String],
 }
 
-/// A recording being written.
-/// After an error, nothing more can be written, but earlier samples stay readable. Dropping it completes the file. If
-/// no sample was written, the file is removed when writing fails or ends.
+/// A recording being written. After an error, nothing more can be written, but earlier samples remain readable.
+/// Dropping this value completes the file. If no sample was written, the file is removed.
 pub struct Recorder {
     path: PathBuf,
     /// `None` after a failure.
@@ -42,7 +41,7 @@ pub struct Recorder {
     /// Number of samples written, including those in the open chunk, and the range of their stamps.
     n_samples: u64,
     stamps: Option<[Stamp; 2]>,
-    /// Samples in closed chunks.
+    /// Span of the samples in closed chunks.
     recorded: RecordedSpan,
     open_bytes: u64,
     open_since: Option<Stamp>,
@@ -55,7 +54,7 @@ impl Recorder {
     /// Starts a recording in a new file.
     ///
     /// # Errors
-    /// If the file already exists, because it may be the recording that is being replayed, or cannot be created.
+    /// If the file cannot be created, or already exists, because it may be the recording that is being replayed.
     pub fn create(path: &Path, recording_metadata: &RecordingMetadata<'_>) -> Result<Self, Error> {
         let file = File::create_new(path).map_err(|source| match source.kind() {
             ErrorKind::AlreadyExists => Error::Exists { path: path.to_owned() },
@@ -115,7 +114,7 @@ impl Recorder {
     /// Writes the index for viewers, completes the file, and returns the recorded span.
     ///
     /// # Errors
-    /// If not everything could be written.
+    /// If some data could not be written.
     pub fn finish(mut self) -> Result<RecordedSpan, Error> {
         let closed = self.close_chunk().and_then(|()| self.mcap()?.finish().map(drop));
         closed.map_err(|error| self.fail(error))?;
@@ -135,7 +134,7 @@ impl Recorder {
     /// removed.
     fn fail(&mut self, error: McapError) -> Error {
         if self.mcap.take().is_some() {
-            // The truncated chunk also contains some samples, so the readable samples are counted.
+            // The truncated chunk also contains readable samples, so they are counted by reading the file.
             self.recorded = readable(&self.path);
             if self.recorded.n_samples == 0 {
                 remove_stub(&self.path);
@@ -155,7 +154,7 @@ impl Recorder {
     fn try_write(&mut self, sample: &Sample) -> mcap::McapResult<()> {
         let stamp = sample.stamp();
         if self.n_messages == 0 && !self.joint_names.is_empty() {
-            // Announced before all samples, so that readers know the joints immediately.
+            // The channel is announced before all samples, so that readers know the joints immediately.
             self.joints_channel()?;
         }
         for (camera, intrinsics) in std::mem::take(&mut self.cameras) {

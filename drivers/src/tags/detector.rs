@@ -13,7 +13,7 @@ const CORRECTED_BITS: usize = 1;
 /// Minimum mean difference in gray value between the cells of a tag and the decision threshold. The authors of AprilTag
 /// consider values below 10 noise; the corners of a barely visible tag are not accurate enough to use.
 const MIN_MARGIN: f32 = 20.0;
-/// From this number of pixels on, quads are searched at half the resolution. Corners are always refined at full
+/// Images with at least this many pixels are searched for quads at half resolution. Corners are always refined at full
 /// resolution.
 const DECIMATE_ABOVE_PX: usize = 1_000_000;
 
@@ -78,17 +78,17 @@ pub struct TagDetector {
 }
 
 impl TagDetector {
-    /// Starts the thread, which ends when this is dropped.
+    /// Starts the thread, which ends when this value is dropped.
     ///
     /// # Errors
     /// If the thread cannot be started.
     pub fn start(family: Family) -> Result<Self, Error> {
-        // The channel holds no images: a busy thread accepts none.
+        // The channel has no capacity, so a busy thread accepts no images.
         let (images, incoming) = sync_channel(0);
         // The thread can continue while the last result waits to be received.
         let (sender, detections) = sync_channel(1);
         let detect_all = move || {
-            // Created here because the detector cannot be sent between threads.
+            // The detector is created on this thread because it cannot be sent between threads.
             let mut detector = detector(family);
             while let Ok(image) = incoming.recv() {
                 if sender.send(detect(&mut detector, &image)).is_err() {
@@ -116,7 +116,7 @@ impl TagDetector {
         self.finish()
     }
 
-    /// Results since the last call. An image that cannot be decoded yields an error.
+    /// Returns the results since the last call. An image that cannot be decoded gives an error.
     pub fn new_detections(&mut self) -> Vec<Result<TagDetections, Error>> {
         let new_detections: Vec<_> = self.detections.try_iter().collect();
         self.n_pending -= new_detections.len();

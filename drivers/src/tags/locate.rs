@@ -1,9 +1,9 @@
 //! Estimates the pose of a camera from tags at known poses.
 //!
 //! All tag corners are projected with the lens model of the camera, and the reprojection error is minimized with the
-//! Levenberg-Marquardt method. The optimization starts from both poses that explain a single tag almost equally well,
-//! since the image of a small square hardly determines to which side it is tilted (Schweighofer and Pinz 2006, "Robust
-//! Pose Estimation from a Planar Target"). If the better pose is not clearly better, no pose is returned.
+//! Levenberg-Marquardt method. The optimization starts from both poses that fit a single tag almost equally well, since
+//! the image of a small square hardly determines in which direction the square is tilted (Schweighofer and Pinz 2006,
+//! "Robust Pose Estimation from a Planar Target"). If neither pose fits clearly better, no pose is returned.
 
 use kinematics::{Intrinsics, Transform, Twist, transform};
 use nalgebra::{Matrix2x3, Matrix3, Matrix3x6, Matrix6, Rotation3, SMatrix, SVector, UnitQuaternion, Vector3, Vector6};
@@ -13,9 +13,9 @@ const CORNER_SIGMA_PX: f64 = 0.2;
 /// Residuals above this count linearly instead of quadratically (Huber 1964), because corners of tags viewed at a
 /// grazing angle are unreliable.
 const HUBER_PX: f64 = 3.0 * CORNER_SIGMA_PX;
-/// If the root mean square error is larger, the corners do not match the tags of the rig file; pixels.
+/// Maximum root mean square error, pixels. If it is larger, the corners do not match the tags of the rig file.
 const MAX_RMS_ERROR_PX: f64 = 3.0;
-/// The cost of the second-best pose must be larger than the best cost by this factor, else the pose is ambiguous.
+/// Minimum ratio of the cost of the second-best pose to the best cost. Below it, the pose is ambiguous.
 const MIN_AMBIGUITY_RATIO: f64 = 3.0;
 const MAX_ITERATIONS: usize = 50;
 
@@ -59,13 +59,13 @@ pub struct CameraPoseEstimate {
     pub rms_error_px: f64,
 }
 
-/// Why the camera pose cannot be estimated.
+/// The reason why the camera pose cannot be estimated.
 #[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
 pub enum LocateError {
     /// The image contains no tag with a known pose.
     #[error("no tag of the rig file is visible")]
     NoTag,
-    /// No pose explains the corners.
+    /// No pose fits the corners.
     #[error(
         "the corners of the tags are {rms_error_px:.1} px off: check the sizes and poses of the tags, and the intrinsics of the camera"
     )]
@@ -73,8 +73,8 @@ pub enum LocateError {
         /// Root mean square error, pixels.
         rms_error_px: f64,
     },
-    /// Two poses explain the tags almost equally well.
-    #[error("a single tag in view is too small to determine to which side it is tilted")]
+    /// Two poses fit the tags almost equally well.
+    #[error("the only visible tag is too small in the image: its pose is ambiguous (two tilts fit)")]
     Ambiguous,
 }
 
@@ -82,14 +82,14 @@ pub enum LocateError {
 struct Corner {
     point_in_world: Vector3<f64>,
     observed_px: [f64; 2],
-    /// Maps the camera frame at mid-exposure to the one at the time of the corner's row.
+    /// Maps the camera frame at mid-exposure to the camera frame at the time of the corner's row.
     row_from_mid_exposure: Transform,
 }
 
 /// Estimates the pose of a camera from tags and their corners in the image, in the order of [`super::TagDetection`].
 ///
 /// # Errors
-/// If no tag is given, no pose explains the corners, or two poses explain them almost equally well.
+/// If no tag is given, no pose fits the corners, or two poses fit them almost equally well.
 pub fn locate(
     camera: &RollingShutterCamera<'_>,
     tags: &[(&TagPlacement, [[f64; 2]; 4])],

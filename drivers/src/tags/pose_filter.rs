@@ -6,8 +6,8 @@ use nalgebra::{Matrix6, Vector6};
 /// Squared Mahalanobis distance from the average above which the object is assumed to have moved. Without motion, this
 /// happens once in 10 000 poses (chi-squared, 6 degrees of freedom).
 const MAX_CHI_SQUARED: f64 = 27.86;
-/// Information in the average decays by this factor per pose, which limits the average to about 30 poses. More are
-/// useless because errors of the lens parameters and of measured tag poses do not average out.
+/// Information in the average decays by this factor per pose, which limits the average to about 30 poses. More poses
+/// would not help, because errors of the lens parameters and of measured tag poses do not average out.
 const FORGETTING_FACTOR: f64 = 0.97;
 
 /// Running average of a pose.
@@ -26,7 +26,7 @@ impl StationaryPoseFilter {
         average
     }
 
-    /// Average with another pose; `None` if that pose is too far away.
+    /// Merges another pose into the average; `None` if that pose is too far away.
     fn merged(&self, pose: &Transform, covariance: &Matrix6<f64>) -> Option<(Transform, Matrix6<f64>)> {
         let (average, average_covariance) = self.average.as_ref()?;
         let average_covariance = average_covariance / FORGETTING_FACTOR;

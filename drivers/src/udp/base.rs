@@ -17,8 +17,8 @@ pub struct UdpBase {
 impl UdpBase {
     /// Listens for poses. With port 0, a free port is used.
     ///
-    /// Poses with a standard deviation above `max_sigma` are skipped: root mean square errors of position and rotation,
-    /// meters and radians. Poses without covariance are accepted.
+    /// Poses with a standard deviation above `max_sigma` are skipped. `max_sigma` contains the root mean square errors
+    /// of position (meters) and rotation (radians). Poses without covariance are accepted.
     pub fn open(address: SocketAddr, max_sigma: [f64; 2]) -> Result<Self, Error> {
         Ok(Self { poses: DatagramReader::open("base", "poses", address)?, max_sigma })
     }

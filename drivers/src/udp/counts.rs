@@ -48,7 +48,8 @@ impl Senders {
     }
 }
 
-/// Adds `more` to a count, and logs it if the count at least doubled. This logs the first events and avoids flooding.
+/// Adds `more` to a count, and logs the count if it has at least doubled. Thus the first events are logged, and the log
+/// is not flooded.
 pub(super) fn count_and_warn(device: &str, n: &mut u64, more: u64, what: impl fmt::Display) {
     let before = n.checked_ilog2();
     *n = n.saturating_add(more);

@@ -15,10 +15,10 @@ use std::time::Duration;
 
 /// Arrival time of the first datagram. Stamps in the seeds are close to it.
 pub(crate) const START_TIME: Stamp = Stamp(1_000_000_000_000);
-/// Limit of received values: meters, radians or the unit of a joint; also of each point coordinate.
+/// Limit of received values and of each point coordinate, in meters, radians or the unit of a joint.
 const MAX_ABS_VALUE: f64 = 1e4;
 
-/// An arm of three joints, a base, and a scanner named `lidar`. Data from their sockets are not used.
+/// An arm with three joints, a base, and a scanner named `lidar`. Data from their sockets are not used.
 struct Readers {
     names: Vec<String>,
     arm: DatagramReader,

@@ -16,7 +16,8 @@ const MAX_WAITING_BYTES: usize = 16 << 20;
 const OVERHEAD_BYTES: usize = 128;
 /// Maximum length of a datagram.
 const MAX_DATAGRAM_BYTES: usize = 65_536;
-/// At the first read, older datagrams are discarded: they arrived while other devices were still being opened.
+/// Maximum age of a datagram at the first read. Older datagrams are discarded, because they arrived while other devices
+/// were still being opened.
 const MAX_BUFFERED_AGE: Duration = Duration::from_millis(200);
 /// Interval at which the thread checks whether it has to stop.
 const POLL: Duration = Duration::from_millis(100);
@@ -57,7 +58,7 @@ struct State {
 }
 
 impl Receiver {
-    /// Listens. With port 0, a free port is used. `device` is its name in messages.
+    /// Listens. With port 0, a free port is used. `device` is the name of the device in messages.
     pub(super) fn open(device: String, address: SocketAddr) -> Result<Self, Error> {
         let bound = UdpSocket::bind(address).and_then(|socket| {
             socket.set_read_timeout(Some(POLL))?;

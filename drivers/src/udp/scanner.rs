@@ -13,7 +13,8 @@ use std::time::{Duration, Instant};
 
 /// A range scanner whose scans are received over UDP.
 ///
-/// A scan is returned when all its parts have arrived, or without the missing ones when the next scan begins.
+/// A scan is returned when all its parts have arrived. If parts are missing when the next scan begins, it is returned
+/// without them.
 #[derive(Debug)]
 pub struct UdpScanner {
     name: Arc<str>,

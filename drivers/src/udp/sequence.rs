@@ -4,9 +4,10 @@ use crate::wire::datagram::{Clock, DatagramHeader};
 use kinematics::{ClockMap, Stamp};
 use std::time::Duration;
 
-/// A larger difference of sequence numbers is not a gap but a restart of the sender.
+/// Maximum gap in the sequence numbers. A larger difference means that the sender restarted.
 const MAX_SEQUENCE_GAP: u64 = 1000;
-/// If the newest sequence number is older than this, a lower one is not late but a restart of the sender.
+/// Maximum delay of a reordered datagram. If the newest datagram is older than this, a lower sequence number means that
+/// the sender restarted.
 const MAX_REORDER_AGE: Duration = Duration::from_secs(1);
 /// Stamps of our own clock older than this, or ahead by more than [`MAX_AHEAD`], are invalid.
 const MAX_AGE: Duration = Duration::from_secs(5);
@@ -16,13 +17,13 @@ const MAX_AHEAD: Duration = Duration::from_millis(1);
 /// Position of a datagram in the sequence.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum SequencePosition {
-    /// It begins a new scan or value, after `n_lost` missing ones.
+    /// The datagram begins a new scan or value, after `n_lost` missing ones.
     New { n_lost: u64 },
-    /// It belongs to the newest scan or value.
+    /// The datagram belongs to the newest scan or value.
     Current,
-    /// It belongs to an older one.
+    /// The datagram belongs to an older scan or value.
     Late,
-    /// It is the first after a restart of the sender.
+    /// The datagram is the first after a restart of the sender.
     Restart,
 }
 

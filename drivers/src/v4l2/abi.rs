@@ -119,7 +119,7 @@ pub(super) struct FrameSize {
     pub(super) index: u32,
     pub(super) fourcc: u32,
     pub(super) kind: u32,
-    /// Discrete: width, height. Otherwise minimum, maximum and step of the width, then of the height.
+    /// If discrete: width, height. Otherwise: minimum, maximum and step of the width, then of the height.
     pub(super) numbers: [u32; 6],
     pub(super) reserved: [u32; 2],
 }
@@ -132,7 +132,7 @@ pub(super) struct FrameInterval {
     pub(super) width: u32,
     pub(super) height: u32,
     pub(super) kind: u32,
-    /// Discrete: the first one. Otherwise minimum, maximum, step.
+    /// If discrete: the first fraction. Otherwise: minimum, maximum, step.
     pub(super) fractions: [Fraction; 3],
     pub(super) reserved: [u32; 2],
 }

@@ -23,9 +23,9 @@ pub struct Config {
     pub meters_per_count: Option<f64>,
     /// Exposure, gain, white balance, brightness.
     pub settings: Settings,
-    /// Which image the next call returns if the caller is slow.
+    /// Selects the image that the next call returns if the caller is slow.
     pub delivery: Delivery,
-    /// How long to try to reconnect to a camera.
+    /// Maximum time for reconnecting to a camera.
     pub reconnect_for: Duration,
 }
 
@@ -33,7 +33,7 @@ pub struct Config {
 /// faults.
 ///
 /// # Errors
-/// If the kernel rejects it.
+/// If the kernel rejects the value.
 pub fn set_control(node: &Path, id: u32, value: i32) -> std::io::Result<()> {
     Ok(device::Device::open(node)?.set_control(id, value)?)
 }

@@ -57,7 +57,7 @@ struct Step {
     value: i32,
     /// Maximum difference when read back.
     tolerance: i32,
-    /// Whether the rig file requires it. Otherwise, a failure is only logged.
+    /// Whether the rig file requires this control. If not, a failure is only logged.
     is_required: bool,
 }
 
@@ -72,7 +72,7 @@ pub(super) struct AppliedSettings {
     pub(super) read_back: Vec<(&'static str, i32)>,
 }
 
-/// Controls of a camera: of a [`Device`], or of tables in tests.
+/// Access to the controls of a camera: a [`Device`], or a table in tests.
 pub(super) trait Controls {
     fn find(&self, id: Id) -> Option<QueryControl>;
     fn menu(&self, id: Id) -> Vec<i32>;
@@ -168,7 +168,7 @@ fn refused(control: &'static str, error: Errno) -> Problem {
     }
 }
 
-/// Controls to set, in order. Automatic modes come first, because a value cannot be set while it is automatic.
+/// Controls to set, in order. Automatic modes come first, because a value cannot be set while its control is automatic.
 fn plan(settings: &Settings, camera: &impl Controls) -> Result<Vec<Step>, Problem> {
     let mut steps = Vec::new();
     exposure(settings.exposure_micros, camera, &mut steps)?;

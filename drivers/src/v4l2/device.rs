@@ -37,7 +37,7 @@ pub(super) struct FilledBuffer {
     pub(super) sequence: u32,
     /// Stamp in nanoseconds; its clock depends on `is_monotonic`.
     pub(super) stamp_nanos: i64,
-    /// Whether the device reports that its stamps are of the kernel's monotonic clock.
+    /// Whether the device reports that its stamps come from the kernel's monotonic clock.
     pub(super) is_monotonic: bool,
     /// Whether the device reports damaged data.
     pub(super) is_damaged: bool,
@@ -132,7 +132,7 @@ impl Device {
         self.list(&abi::ENUM_FRAMEINTERVALS, request_at)
     }
 
-    /// Requests a format and returns the one that the device selected.
+    /// Requests a format and returns the format that the device selected.
     pub(super) fn set_format(&self, fourcc: u32, [width, height]: [u32; 2]) -> rustix::io::Result<abi::PixFormat> {
         let pix = abi::PixFormat { width, height, fourcc, field: abi::FIELD_NONE, ..Default::default() };
         let mut format = abi::Format { kind: abi::VIDEO_CAPTURE, padding: 0, pix, rest: [0; 19] };
@@ -140,7 +140,7 @@ impl Device {
         Ok(format.pix)
     }
 
-    /// Requests a rate in images per second and returns the one that the device selected, or `None` if the rate cannot
+    /// Requests a rate in images per second and returns the rate that the device selected, or `None` if the rate cannot
     /// be set.
     pub(super) fn set_rate_hz(&self, rate_hz: f64) -> rustix::io::Result<Option<f64>> {
         let mut parm = abi::StreamParm { kind: abi::VIDEO_CAPTURE, capture: Default::default(), rest: [0; 40] };
@@ -152,7 +152,7 @@ impl Device {
         Ok(Some(super::format::rate_of(parm.capture.time_per_frame)))
     }
 
-    /// Whether the input is a high-definition television signal, as on an HDMI grabber.
+    /// Whether the input is a high-definition television signal, as with an HDMI grabber.
     pub(super) fn is_hdtv(&self) -> bool {
         let mut index = 0;
         if self.ioctl(&abi::G_INPUT, &mut index).is_err() {
@@ -213,9 +213,9 @@ impl Device {
 /// Step at which a stream was rejected.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Refused {
-    /// No memory for images, or another program uses the device.
+    /// Allocating buffers: there is no memory for images, or another program uses the device.
     Buffers(Errno),
-    /// `STREAMON`, usually because of the USB bandwidth.
+    /// Starting the stream (`STREAMON`), usually because of the USB bandwidth.
     Begin(Errno),
 }
 

@@ -26,7 +26,7 @@ pub struct FoundCamera {
 }
 
 impl FoundCamera {
-    /// Name for the rig file: a udev link, else the serial number, else the bus address.
+    /// Name for the rig file: a udev link, or else the serial number, or else the bus address.
     pub fn address(&self) -> String {
         let link = self.links.first().map(|link| link.display().to_string());
         link.or_else(|| self.serial.clone()).unwrap_or_else(|| self.bus.clone())
@@ -88,7 +88,8 @@ pub(super) fn modes(device: &Device) -> Vec<Mode> {
     modes
 }
 
-/// Nodes that match `device` of a rig file: a path, or a serial number or bus address shared by the nodes of a camera.
+/// Nodes that match `device` of a rig file, which is a path, or a serial number or bus address shared by the nodes of a
+/// camera.
 pub(super) fn candidates(device: &str) -> Result<Vec<PathBuf>, Problem> {
     if device.starts_with('/') {
         return Ok(vec![PathBuf::from(device)]);

@@ -10,7 +10,7 @@ use crate::{Error, PixelFormat, V4l2Colors, YuvColors, YuvLayout};
 const SAME_RATE_FRAC: f64 = 0.01;
 
 impl V4l2Format {
-    /// Kernel codes of the formats. Some devices use another one for MJPEG.
+    /// Kernel codes of the formats. Some devices use another code for MJPEG.
     const CODES: [(&[u8; 4], Self); 9] = [
         (b"YUYV", Self::Yuyv),
         (b"UYVY", Self::Uyvy),
@@ -71,7 +71,7 @@ pub struct Mode {
     pub format: V4l2Format,
     /// Supported sizes.
     pub sizes: Sizes,
-    /// Images per second at these sizes (for a range of sizes, at the largest).
+    /// Images per second at these sizes; for a range of sizes, at the largest size.
     pub rates: Rates,
 }
 
@@ -96,7 +96,7 @@ pub enum Sizes {
 pub enum Rates {
     /// The device does not report rates.
     Unknown,
-    /// One of these.
+    /// A list of supported rates.
     List(Vec<f64>),
     /// Any rate in this range.
     Range {
@@ -165,7 +165,7 @@ impl Rates {
     }
 }
 
-/// Selects a mode: of the given format, else of the first suitable one in [`V4l2Format::COLOR_FORMATS`].
+/// Selects a mode of the given format, or else of the first suitable format in [`V4l2Format::COLOR_FORMATS`].
 pub(super) fn choose(modes: &[Mode], format: Option<V4l2Format>, size_px: [u32; 2], rate_hz: f64) -> Option<&Mode> {
     let fits = |mode: &&Mode| mode.sizes.has(size_px) && mode.rates.has(rate_hz);
     let of = |format: V4l2Format| modes.iter().filter(move |mode| mode.format == format).find(fits);
@@ -194,7 +194,7 @@ pub(super) fn usb_bytes_per_sec(mbits: f64) -> f64 {
     }
 }
 
-/// Describes modes that exceed a bandwidth: for each, the lowest rate that does.
+/// Describes the modes that exceed a bandwidth, each with the lowest rate that exceeds it.
 pub(super) fn modes_exceeding(modes: &[Mode], bytes_per_sec: f64) -> Vec<String> {
     let exceeds = |mode: &Mode| {
         let [width, height] = mode.sizes.max();

@@ -3,7 +3,7 @@
 //! `abi.rs` declares the kernel interface, and only `device.rs` calls it. `config.rs` and `problem.rs` define
 //! configuration and errors. `find.rs` lists devices; `format.rs`, `pixel_format.rs` and `controls.rs` select formats
 //! and settings; `stream.rs` and `sequence.rs` read images; `camera.rs` handles disconnections. On other systems than
-//! Linux, only the names of the formats are available, since rig files need them everywhere.
+//! Linux, only the names of the formats are available, because rig files need them on every system.
 
 #[cfg(target_os = "linux")]
 mod abi;
@@ -28,7 +28,7 @@ mod sequence;
 mod stream;
 
 #[cfg(target_os = "linux")]
-pub use camera::{Counts, V4l2Camera};
+pub use camera::V4l2Camera;
 #[cfg(target_os = "linux")]
 pub use config::{Config, control, set_control};
 #[cfg(target_os = "linux")]
@@ -41,11 +41,11 @@ pub use pixel_format::V4l2Format;
 #[cfg(target_os = "linux")]
 pub use problem::Problem;
 
-/// Which of several queued images is delivered next.
+/// Selects which of several queued images is delivered next.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Delivery {
-    /// The oldest. No images are dropped as long as the caller keeps up on average.
+    /// The oldest image. No images are dropped as long as the caller keeps up on average.
     Every,
-    /// The newest; older ones count as skipped.
+    /// The newest image. Older images count as skipped.
     Newest,
 }

@@ -49,7 +49,7 @@ pub enum Problem {
         /// All modes of the device.
         offered: String,
     },
-    /// The device selected another mode than the requested one.
+    /// The device selected a mode that differs from the requested one.
     #[error("requested {requested}, but it selected {got}")]
     OtherMode {
         /// Requested mode.

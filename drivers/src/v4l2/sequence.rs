@@ -9,8 +9,8 @@ pub(super) struct Sequence {
 impl Sequence {
     /// Records the sequence number of the next image and returns the number of images missing before it.
     ///
-    /// Numbers may wrap. A number that repeats or decreases is not counted, because some devices do not count or
-    /// restart.
+    /// Numbers may wrap. A number that repeats or decreases counts no missing images, because some devices do not
+    /// count, or restart.
     pub(super) fn n_skipped_before(&mut self, number: u32) -> u64 {
         let ahead = self.last.replace(number).map_or(1, |last| number.wrapping_sub(last));
         if ahead > u32::MAX / 2 { 0 } else { u64::from(ahead.saturating_sub(1)) }

@@ -6,6 +6,7 @@ use super::device::{Device, FilledBuffer, Refused, Stream};
 use super::format::{self, Mode};
 use super::sequence::Sequence;
 use super::{Config, Delivery, Problem, V4l2Format, find};
+use crate::reconnecting::Failure;
 use crate::{Error, Image, PixelFormat, V4l2Colors, clock};
 use kinematics::Stamp;
 use rustix::io::Errno;
@@ -15,7 +16,7 @@ use std::time::{Duration, Instant};
 
 /// Number of image buffers: a quarter of a second at 30 Hz.
 const N_BUFFERS: u32 = 8;
-/// A stamp that is earlier than the start of the stream or later than now by more than this is of another clock,
+/// A stamp that is earlier than the start of the stream or later than now by more than this comes from another clock,
 /// regardless of its flag.
 const MAX_STAMP_ERROR_SECS: f64 = 1.0;
 /// Maximum duration of an exposure query, as a fraction of the time between two images.
@@ -35,7 +36,7 @@ pub(super) struct V4l2Stream {
     started_at: Stamp,
     /// Number of lost images that are not reported yet.
     n_unreported: u64,
-    n_images: u64,
+    /// Number of damaged images since [`Self::take_n_damaged`]. They also count as skipped.
     n_damaged: u64,
     last_image_at: Instant,
     has_warned_of_clock: bool,
@@ -43,9 +44,8 @@ pub(super) struct V4l2Stream {
 
 impl V4l2Stream {
     /// Opens the device of a configuration and starts its stream.
-    pub(super) fn start(config: &Config) -> Result<Self, Error> {
-        let named = |problem| Error::V4l2 { camera: config.name.clone(), problem: Box::new(problem) };
-        let candidates = find::candidates(&config.device).map_err(named)?;
+    pub(super) fn start(config: &Config) -> Result<Self, Failure<Problem>> {
+        let candidates = find::candidates(&config.device)?;
         // A depth camera has nodes for color, infrared and depth under one serial number. The node with the most
         // preferred format is used.
         let rank = |path: &&PathBuf| {
@@ -55,14 +55,13 @@ impl V4l2Stream {
         };
         match candidates.iter().min_by_key(rank) {
             Some(path) => Self::start_node(config, path),
-            None => Err(named(Problem::NoDevice { device: config.device.clone() })),
+            None => Err(Problem::NoDevice { device: config.device.clone() }.into()),
         }
     }
 
-    fn start_node(config: &Config, path: &Path) -> Result<Self, Error> {
-        let named = |problem| Error::V4l2 { camera: config.name.clone(), problem: Box::new(problem) };
-        let device = open(config, path).map_err(named)?;
-        let (mode, pix) = set_mode(config, path, &device).map_err(named)?;
+    fn start_node(config: &Config, path: &Path) -> Result<Self, Failure<Problem>> {
+        let device = open(config, path)?;
+        let (mode, pix) = set_mode(config, path, &device)?;
         let colors = V4l2Colors {
             colorspace: pix.colorspace,
             ycbcr_enc: pix.ycbcr_enc,
@@ -70,17 +69,17 @@ impl V4l2Stream {
             is_hdtv: device.is_hdtv(),
         };
         if mode.format == V4l2Format::Z16 && config.meters_per_count.is_none() {
-            return Err(named(Problem::NoDepthScale));
+            return Err(Problem::NoDepthScale.into());
         }
-        let format = mode.format.pixels(colors, config.meters_per_count.unwrap_or(0.0))?;
-        controls::apply(&config.settings, &device).map_err(named)?;
+        let format = mode.format.pixels(colors, config.meters_per_count.unwrap_or(0.0)).map_err(Failure::Final)?;
+        controls::apply(&config.settings, &device)?;
         let requested = requested(config, Some(mode.format));
         let started_at = clock::now();
         let stream = device.stream(N_BUFFERS).map_err(|refused| {
             let bytes_per_sec = mode.format.bytes_per_sec(config.intrinsics.size_px, config.rate_hz);
-            named(stream_problem(refused, path, requested.clone(), bytes_per_sec))
+            stream_problem(refused, path, requested.clone(), bytes_per_sec)
         })?;
-        let applied = controls::confirm(&config.settings, stream.device()).map_err(named)?;
+        let applied = controls::confirm(&config.settings, stream.device())?;
         Ok(Self {
             stream,
             camera: config.name.as_str().into(),
@@ -92,7 +91,6 @@ impl V4l2Stream {
             sequence: Sequence::default(),
             started_at,
             n_unreported: 0,
-            n_images: 0,
             n_damaged: 0,
             last_image_at: Instant::now(),
             has_warned_of_clock: false,
@@ -109,14 +107,9 @@ impl V4l2Stream {
         &self.applied.read_back
     }
 
-    /// Number of images returned since the start.
-    pub(super) fn n_images(&self) -> u64 {
-        self.n_images
-    }
-
-    /// Number of damaged images since the start. They also count as skipped.
-    pub(super) fn n_damaged(&self) -> u64 {
-        self.n_damaged
+    /// Number of damaged images since the last call.
+    pub(super) fn take_n_damaged(&mut self) -> u64 {
+        std::mem::take(&mut self.n_damaged)
     }
 
     /// Time since the last complete image.
@@ -146,7 +139,6 @@ impl V4l2Stream {
                 Some(Ok(mut image)) => {
                     image.exposure_secs = self.exposure_secs(config.rate_hz);
                     image.n_skipped = std::mem::take(&mut self.n_unreported);
-                    self.n_images += 1;
                     self.last_image_at = Instant::now();
                     return Ok(Some(image));
                 }
@@ -164,7 +156,7 @@ impl V4l2Stream {
         }
     }
 
-    /// Takes the next buffer to deliver: the oldest, or the newest, in which case older ones are requeued.
+    /// Takes the next buffer to deliver: the oldest or the newest. In the latter case, older buffers are requeued.
     fn next_filled(&mut self, delivery: Delivery, deadline: Instant) -> Result<Option<FilledBuffer>, Problem> {
         let mut taken: Option<FilledBuffer> = None;
         loop {
@@ -204,8 +196,8 @@ impl V4l2Stream {
         .pack_rows(self.bytes_per_line)
     }
 
-    /// The stamp of the device if it is on our clock, else the current time. `stamp_to_mid_exposure_millis` of the rig
-    /// file defines its relation to the exposure.
+    /// The stamp of the device if it comes from our clock, or else the current time. `stamp_to_mid_exposure_millis` of
+    /// the rig file converts the stamp to mid-exposure.
     fn stamp_of(&mut self, filled: &FilledBuffer) -> Stamp {
         let now = clock::now();
         let stamp = Stamp(filled.stamp_nanos);
@@ -215,7 +207,7 @@ impl V4l2Stream {
         }
         if !std::mem::replace(&mut self.has_warned_of_clock, true) {
             log::warn!(
-                "camera {:?}: its stamps are not of the monotonic clock; images are stamped on arrival",
+                "camera {:?}: its stamps do not come from the monotonic clock; images are stamped on arrival",
                 self.camera
             );
         }
@@ -251,7 +243,7 @@ fn stream_problem(refused: Refused, path: &Path, mode: String, bytes_per_sec: Op
     }
 }
 
-/// An error of a streaming device is treated as a disconnection.
+/// Converts an error of a streaming device to a disconnection.
 fn lost(error: Errno) -> Problem {
     Problem::Unplugged { source: error.into() }
 }

@@ -11,10 +11,10 @@ use serde::{Deserialize, Serialize};
 pub const VERSION: u32 = 1;
 /// Maximum number of datagrams per scan.
 pub const MAX_PARTS: u32 = 64;
-/// Maximum absolute value of coordinates, ranges and joint values in their units; larger ones are errors of the
+/// Maximum absolute value of coordinates, ranges and joint values in their units. Larger values are errors of the
 /// sender.
 const MAX_ABS_VALUE: f64 = 1e4;
-/// Maximum absolute angle, rad; larger ones are errors of the sender.
+/// Maximum absolute angle, rad. Larger angles are errors of the sender.
 const MAX_ANGLE_RAD: f64 = 100.0;
 /// Maximum number of characters of a parser message in an error.
 const MAX_ERROR_CHARS: usize = 200;
@@ -30,7 +30,7 @@ const UNIT_NORM_TOLERANCE: f64 = 1e-3;
 pub enum Clock {
     /// `CLOCK_MONOTONIC` of the receiving computer, on which the sender must run, too.
     Monotonic,
-    /// Any other clock with a steady rate. It is mapped to ours by the arrival times.
+    /// Any other clock with a steady rate. It is mapped to our clock by the arrival times.
     Device,
 }
 
@@ -48,7 +48,7 @@ pub struct DatagramHeader {
 /// A range scan, or a part of one.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ScanPart {
-    /// Equal in all parts of a scan.
+    /// Header, which is equal in all parts of a scan.
     pub header: DatagramHeader,
     /// Name of the scanner in the rig file.
     pub frame: String,
@@ -73,8 +73,8 @@ pub struct PoseDatagram {
 }
 
 impl PoseDatagram {
-    /// Reported uncertainty: root mean square errors of position in meters and rotation in radians; `None` without a
-    /// covariance.
+    /// Uncertainty that the covariance reports: root mean square errors of position (meters) and rotation (radians);
+    /// `None` without a covariance.
     pub fn sigmas(&self) -> Option<[f64; 2]> {
         let covariance = self.covariance.as_ref()?;
         let trace = |first: usize| (first..first + 3).map(|ix| covariance[7 * ix]).sum::<f64>();
@@ -87,11 +87,11 @@ impl PoseDatagram {
 pub struct JointsDatagram {
     /// Header.
     pub header: DatagramHeader,
-    /// Radians or meters.
+    /// Positions, radians or meters.
     pub position: Vec<f64>,
-    /// Radians or meters per second; empty if the sender does not report it.
+    /// Velocities, radians or meters per second; empty if the sender does not report them.
     pub velocity: Vec<f64>,
-    /// Newton meters or newtons; empty if the sender does not report it.
+    /// Efforts, newton meters or newtons; empty if the sender does not report them.
     pub effort: Vec<f64>,
 }
 
@@ -332,7 +332,7 @@ pub fn decode_joints(bytes: &[u8], names: &[String]) -> Result<JointsDatagram, M
     Ok(JointsDatagram { header: DatagramHeader { seq, clock, stamp_nanos }, position, velocity, effort })
 }
 
-/// One entry per direction of a part; `None` if there was no echo.
+/// Positions of the echoes: one entry per direction of a part; `None` if there was no echo.
 fn echo_positions(wire: &WireScan) -> Result<Vec<Option<[f32; 3]>>, Malformed> {
     match (&wire.points_m, &wire.ranges_m) {
         (Some(numbers), None) => {
@@ -376,7 +376,7 @@ fn position_from_polar(range_m: f64, azimuth_rad: f64, elevation_rad: f64) -> [f
 fn check_kind(bytes: &[u8], expected: &'static str) -> Result<(), Malformed> {
     let Kind { kind, version } = parse_json(bytes)?;
     if kind != expected {
-        // The sender's own text is not repeated, because it may be of any length.
+        // The text from the sender is not repeated, because it may be of any length.
         return Err(invalid(format!("the kind is not {expected:?}")));
     }
     match version == VERSION {
@@ -457,7 +457,7 @@ mod tests {
         let names: Vec<String> = (1..=7).map(|n| format!("panda_joint{n}")).collect();
         let joints = examples.iter().filter(|text| decode_joints(text.as_bytes(), &names).is_ok()).count();
         assert_eq!((examples.len(), scans.len(), poses, joints), (5, 2, 1, 2));
-        // Ahead, then a direction without echo, then to the left.
+        // The directions are ahead, one without echo, and to the left.
         let ranges = &scans[1].points;
         assert_eq!(ranges.len(), 2);
         assert!((ranges[0].position_m[0] - 2.0).abs() < 1e-6 && ranges[0].position_m[1].abs() < 1e-6, "{ranges:?}");

@@ -1,8 +1,7 @@
 //! Foxglove messages for images, intrinsics and poses.
 //!
-//! Color images keep the device's own bytes, and depth images their raw counts. Stamps are exact to the nanosecond,
-//! numbers to the bit.
-//! Field numbers are those of [`super::descriptor`].
+//! Color images keep the bytes of the device, and depth images their raw counts. Stamps are exact to the nanosecond,
+//! and numbers are bit-exact. Field numbers are those of [`super::descriptor`].
 
 use super::protobuf::{Field, Message, fields};
 use super::{Malformed, descriptor};
@@ -25,7 +24,7 @@ const YUV_COLORS_NAMES: [(&str, YuvColors); 4] = [
     ("bt709-limited", YuvColors { matrix: YuvMatrix::Bt709, range: YuvRange::Limited }),
     ("bt709-full", YuvColors { matrix: YuvMatrix::Bt709, range: YuvRange::Full }),
 ];
-/// Foxglove's names of layouts. The first name of a layout is written; all are accepted.
+/// Foxglove's names of layouts. The first name of a layout is written; all names are accepted.
 const YUV_LAYOUTS: [(&str, YuvLayout); 5] = [
     ("yuyv", YuvLayout::Yuyv),
     ("uyvy", YuvLayout::Uyvy),

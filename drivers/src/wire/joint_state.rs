@@ -40,7 +40,7 @@ struct Timestamp {
 
 const NANOS_PER_SEC: i64 = 1_000_000_000;
 
-/// Encodes joint states as JSON. Finite numbers are restored bit for bit, others as NaN.
+/// Encodes joint states as JSON. Decoding restores finite numbers bit for bit, and others as NaN.
 pub fn encode(state: &JointState) -> Vec<u8> {
     let finite = |numbers: &[f64]| numbers.iter().map(|number| number.is_finite().then_some(*number)).collect();
     let nsec = u32::try_from(state.stamp.0.rem_euclid(NANOS_PER_SEC)).expect("the remainder is below one billion");

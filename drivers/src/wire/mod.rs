@@ -8,7 +8,7 @@ pub mod joint_state;
 pub mod point_cloud;
 pub mod protobuf;
 
-/// Bytes that do not follow their format.
+/// The bytes do not follow their format.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum Malformed {
@@ -47,7 +47,7 @@ pub enum Malformed {
         /// Name of the pixel format.
         name: String,
     },
-    /// JSON that does not match its schema.
+    /// The JSON does not match its schema.
     #[error("{reason}")]
     Json {
         /// Message of the parser.

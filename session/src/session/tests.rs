@@ -1,11 +1,13 @@
 //! Scoring image by image gives the same result as scoring all at once.
 
 use super::*;
-use calibration::CalibratedCamera;
-use kinematics::{Stamp, Transform};
+use calibration::{CalibratedCamera, TrialReport};
+use keyframe::Split;
+use kinematics::Transform;
+use std::path::Path;
 use trainer::Error;
 use trainer::checkpoint::PendingCheckpoint;
-use trainer::gpu::GpuOptions;
+use trainer::gpu::{GpuOptions, PassTiming};
 
 const SIZE_PX: [u32; 2] = [4, 2];
 const N_TESTS: u8 = 5;
@@ -137,21 +139,24 @@ fn stepwise_scoring_equals_scoring_at_once() {
     let (session, n_drawn) = session_with_evaluation_due(&stop);
     let mut stepwise = session.with_stepwise_scoring();
     stepwise.evaluate_when_due().expect("opened");
-    assert!(stepwise.is_scoring() && stepwise.reported.is_empty() && n_drawn.get() == 0, "the caller scores");
+    assert!(
+        stepwise.is_scoring() && stepwise.reporter.evaluations().is_empty() && n_drawn.get() == 0,
+        "the caller scores"
+    );
     for n in 1..=3 {
         assert!(stepwise.is_scoring());
         stepwise.score_next().expect("scored");
         assert_eq!(n_drawn.get(), n, "one image at a time");
     }
     assert!(!stepwise.is_scoring());
-    let [one, other] = [&at_once, &stepwise].map(|session| &session.reported[0]);
+    let [one, other] = [&at_once, &stepwise].map(|session| &session.reporter.evaluations()[0]);
     assert_eq!((one.n_images, one.step), (3, 1));
     assert_eq!((other.n_images, other.step), (3, 1));
     assert!(one.scores == other.scores && one.scores.psnr.is_some());
     assert!((other.seconds - 1.0).abs() < 0.9, "{} s: when the evaluation was due", other.seconds);
     assert!(stepwise.psnr() == at_once.psnr());
     stepwise.score_next().expect("nothing to do");
-    assert_eq!((stepwise.reported.len(), n_drawn.get()), (1, 3));
+    assert_eq!((stepwise.reporter.evaluations().len(), n_drawn.get()), (1, 3));
 }
 
 #[test]
@@ -163,5 +168,5 @@ fn evaluation_is_dropped_when_stopping() {
     session.score_next().expect("scored");
     stop.request();
     session.score_next().expect("dropped");
-    assert!(!session.is_scoring() && session.reported.is_empty() && n_drawn.get() == 1);
+    assert!(!session.is_scoring() && session.reporter.evaluations().is_empty() && n_drawn.get() == 1);
 }

@@ -41,7 +41,7 @@ impl EmulatedMotors {
             let joints_of_bus = joints_of_bus.map(|(joint_ix, motor)| EmulatedJoint {
                 joint_ix,
                 config: motor.clone(),
-                motor: EmulatedMotor::new(motor.family, DAMIAO_LIMITS),
+                motor: EmulatedMotor::new(&*motor.protocol, DAMIAO_LIMITS),
             });
             let (bus, joints_of_bus, track) = (Bus::open(bus)?, joints_of_bus.collect(), track.clone());
             let flags = Arc::clone(&motors.flags);

@@ -1,13 +1,13 @@
 //! `fieldrig bench memory`: memory use of a long run, and its growth rate once the keyframe store is full.
 
+use super::run_flags;
 use super::runs_args::print_result;
 use crate::commands::run;
 use crate::exit::{BadArgument, Exit};
 use crate::print;
 use anyhow::Context;
 use bench::memory::MemoryRun;
-use bench::{BenchResult, Sample, Viewer};
-use clap::Parser;
+use bench::{BenchResult, Sample, Viewer, ViewerOptions};
 use session::run_folder::CreatedFolders;
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
@@ -50,19 +50,12 @@ pub(crate) struct Args {
     run_flags: Vec<OsString>,
 }
 
-/// The flags of `run`, parsed as a command line.
-#[derive(Debug, Parser)]
-struct RunFlags {
-    #[command(flatten)]
-    args: run::Args,
-}
-
 pub(super) fn run(args: &Args) -> anyhow::Result<Exit> {
     args.check()?;
     std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
     // Checkpoints are part of a run, so they are written, and removed afterwards with their folder.
     let run_folder = args.out.join(format!("run-{}", std::process::id()));
-    let measured = args.run_flags(&run_folder).and_then(|flags| measure(args, &flags));
+    let measured = args.run_flags(&run_folder).map_err(Into::into).and_then(|flags| measure(args, &flags));
     if run_folder.exists()
         && let Err(error) = std::fs::remove_dir_all(&run_folder)
     {
@@ -82,7 +75,8 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Exit> {
 fn measure(args: &Args, flags: &run::Args) -> anyhow::Result<(MemoryRun, Option<drivers::Error>)> {
     let mut running = run::start(flags, None, &mut CreatedFolders::default())?;
     let address = running.server.address();
-    let viewers: Vec<Viewer> = (0..args.viewers).map(|_| Viewer::connect(address)).collect::<bench::Result<_>>()?;
+    let viewers: Vec<Viewer> =
+        (0..args.viewers).map(|_| Viewer::connect(address, ViewerOptions::default())).collect::<bench::Result<_>>()?;
     let every = Duration::from_secs_f64(args.every_secs);
     let mut measured = MemoryRun {
         input: args.input(),
@@ -141,27 +135,15 @@ impl Args {
         Ok(())
     }
 
-    fn run_flags(&self, folder: &Path) -> anyhow::Result<run::Args> {
-        let mut line: Vec<OsString> = vec!["run".into(), self.rig_file.clone().into()];
+    fn run_flags(&self, folder: &Path) -> Result<run::Args, BadArgument> {
+        let mut flags: Vec<OsString> = Vec::new();
         if self.sim {
-            line.push("--sim".into());
+            flags.push("--sim".into());
         }
         if let Some(from) = &self.from {
-            line.extend(["--from".into(), from.into()]);
+            flags.extend(["--from".into(), from.into()]);
         }
-        line.extend(["--seconds".into(), self.seconds.to_string().into()]);
-        line.extend(["--out".into(), folder.into()]);
-        line.extend(["--listen".into(), "127.0.0.1:0".into()]);
-        if self.json {
-            line.push("--json".into());
-        }
-        line.extend(self.run_flags.iter().cloned());
-        let flags = RunFlags::try_parse_from(line).map_err(|error| {
-            let message = error.to_string();
-            let first = message.lines().next().unwrap_or_default();
-            BadArgument(format!("flags of run: {}", first.strip_prefix("error: ").unwrap_or(first)))
-        })?;
-        Ok(flags.args)
+        run_flags::parse(&self.rig_file, self.seconds, (folder, self.json), flags, &self.run_flags)
     }
 
     fn input(&self) -> String {
@@ -175,6 +157,7 @@ impl Args {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use clap::Parser;
 
     #[derive(Debug, Parser)]
     struct Flags {

@@ -5,7 +5,9 @@ mod budget;
 mod curve;
 mod field;
 mod kernels;
+mod live;
 mod memory;
+mod run_flags;
 mod runs_args;
 mod stability;
 mod stamps;
@@ -36,6 +38,9 @@ enum BenchCommand {
     Stability(stability::Args),
     /// Errors of image stamps with jitter and clock drift, as a histogram
     Stamps(stamps::Args),
+    /// A live run as an operator sees it: latency of pictures, shutter to model, and PSNR over time with right and wrong
+    /// calibration
+    Live(live::Args),
     /// Memory use of a long run by component, and its growth rate once the keyframe store is full
     Memory(memory::Args),
 }
@@ -49,6 +54,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         BenchCommand::Ablation(args) => ablation::run(args),
         BenchCommand::Stability(args) => stability::run(args),
         BenchCommand::Stamps(args) => stamps::run(args),
+        BenchCommand::Live(args) => live::run(args),
         BenchCommand::Memory(args) => memory::run(args),
     }
 }

@@ -9,7 +9,8 @@ use crate::method_entry::MethodEntry;
 use crate::model_metadata::METADATA_FILE;
 use crate::model_options::{MethodOptions, ModelOptions, default_options};
 use crate::{Aligned, Error, Method, Picture, Progress, RenderRequest, Restartable};
-use calibration::{Alignment, CalibratedCamera, ParamSet, TrialReport};
+use calibration::Alignment;
+use calibration::{CalibratedCamera, ParamSet, TrialReport};
 use keyframe::{Keyframe, Split};
 use kinematics::Stamp;
 use serde::{Deserialize, Serialize};
@@ -86,7 +87,7 @@ impl MeanColor {
         keyframes: &[Arc<Keyframe>],
     ) -> Result<(Self, Vec<Arc<Keyframe>>), Error> {
         let (mut model, signatures) = Self::of_state(checkpoint)?;
-        let (matched, others) = keyframe_signature::match_keyframes(&signatures, keyframes, Arc::clone)?;
+        let (matched, others) = keyframe_signature::match_keyframes(&signatures, keyframes)?;
         model.keyframes = matched;
         Ok((model, others))
     }
@@ -122,7 +123,7 @@ fn mean_srgb(keyframe: &Keyframe) -> [f64; 3] {
 }
 
 impl Restartable for MeanColor {
-    fn restart(&mut self) -> Result<(), Error> {
+    fn restart(&mut self, _alignment: &Alignment) -> Result<(), Error> {
         *self = Self::new(self.options.clone());
         Ok(())
     }

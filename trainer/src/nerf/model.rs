@@ -10,9 +10,9 @@ use super::options::{NerfBudget, NerfOptions};
 use super::rays::{self, RayImage, RaySampling};
 use super::sizes::Sizes;
 use crate::checkpoint::PendingCheckpoint;
-use crate::gpu::{Gpu, PassTiming, PendingRead};
-use crate::method::submit_millis;
+use crate::gpu::{Gpu, PassTiming};
 use crate::model_options::ModelOptions;
+use crate::submits::Submits;
 use crate::view::{Camera, projections};
 use crate::{Bounds, Error, Method, Picture, Progress, RenderRequest, Restartable};
 use calibration::Alignment;
@@ -49,7 +49,7 @@ pub struct NerfModel {
     is_extent_stale: bool,
     /// Number of images, from the first, whose hints were applied to the field.
     n_hinted: usize,
-    in_flight: Option<InFlight>,
+    submits: Submits,
     /// Image parameters that are optimized together with the field.
     learned_params: ParamSet,
     trials: Trials,
@@ -62,16 +62,6 @@ pub struct NerfModel {
     step: u64,
     /// Steps of rejected trials.
     n_discarded_steps: u64,
-    step_millis: f64,
-    /// Whether pictures are requested.
-    is_watched: bool,
-}
-
-#[derive(Debug)]
-struct InFlight {
-    batch: PendingRead,
-    n_steps: u64,
-    since: Instant,
 }
 
 impl NerfModel {
@@ -79,7 +69,7 @@ impl NerfModel {
     pub fn new(gpu: Arc<Gpu>, options: ModelOptions<NerfOptions>) -> Result<Self, Error> {
         Ok(Self {
             gpu,
-            learned_params: images::given(&options.common.cameras),
+            learned_params: images::image_params_of_set(options.common.cameras.always()),
             trials: Trials::of(&options.common.cameras),
             options,
             images: Vec::new(),
@@ -91,10 +81,8 @@ impl NerfModel {
             compiled: None,
             is_extent_stale: false,
             n_hinted: 0,
-            in_flight: None,
+            submits: Submits::new(),
             step: 0,
-            step_millis: 0.0,
-            is_watched: false,
         })
     }
 
@@ -212,11 +200,7 @@ impl NerfModel {
 
     /// Waits for the submit in flight.
     fn finish_in_flight(&mut self) -> Result<(), Error> {
-        let Some(in_flight) = self.in_flight.take() else { return Ok(()) };
-        in_flight.batch.finish::<u32>(&self.gpu)?;
-        let millis = in_flight.since.elapsed().as_secs_f64() * 1e3 / in_flight.n_steps.max(1) as f64;
-        self.step_millis = if self.step_millis == 0.0 { millis } else { 0.8 * self.step_millis + 0.2 * millis };
-        Ok(())
+        self.submits.finish(&self.gpu).map(drop)
     }
 
     /// Records the next step as the `slot_ix`-th of a submit.
@@ -237,12 +221,10 @@ impl NerfModel {
 
     /// Number of steps that fit into the time limit of a submit.
     fn steps_per_submit(&self) -> u64 {
-        if self.step_millis == 0.0 || self.gpu.is_software() {
-            return 1;
+        match self.submits.n_steps_in_limit() {
+            Some(n) if !self.gpu.is_software() => n.clamp(1, STEPS_PER_SUBMIT as u64),
+            _ => 1,
         }
-        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped")]
-        let n = (submit_millis(self.is_watched) / self.step_millis).clamp(1.0, STEPS_PER_SUBMIT as f64) as u64;
-        n
     }
 
     fn draw(
@@ -267,11 +249,12 @@ impl NerfModel {
 }
 
 impl Restartable for NerfModel {
-    fn restart(&mut self) -> Result<(), Error> {
+    fn restart(&mut self, _alignment: &Alignment) -> Result<(), Error> {
         self.finish_in_flight()?;
         let compiled = self.compiled.take();
-        let is_watched = self.is_watched;
-        *self = Self { compiled, is_watched, ..Self::new(self.gpu.clone(), self.options.clone())? };
+        let is_watched = self.submits.is_watched();
+        *self = Self { compiled, ..Self::new(self.gpu.clone(), self.options.clone())? };
+        self.set_watched(is_watched);
         Ok(())
     }
 
@@ -334,7 +317,7 @@ impl Method for NerfModel {
         let Some((_, field_trainer)) = &mut self.field else { return Err(Error::DeviceLost) };
         let batch = field_trainer.submit(&self.gpu);
         self.finish_in_flight()?; // Waits for the previous submit while this one runs.
-        self.in_flight = Some(InFlight { batch, n_steps, since });
+        self.submits.begin(batch, n_steps, since);
         if n_steps == n {
             self.finish_in_flight()?; // The caller expects `n` completed steps.
         }
@@ -367,7 +350,7 @@ impl Method for NerfModel {
     }
 
     fn set_watched(&mut self, watched: bool) {
-        self.is_watched = watched;
+        self.submits.set_watched(watched);
     }
 
     fn bounds(&mut self) -> Result<Option<Bounds>, Error> {
@@ -400,7 +383,7 @@ impl Method for NerfModel {
             step: self.step,
             primitives: field.map_or(0, |field_trainer| field_trainer.field.n_entries.into()),
             bytes: field.map_or(0, FieldTrainer::bytes),
-            step_millis: self.step_millis,
+            step_millis: self.submits.step_millis(),
         }
     }
 

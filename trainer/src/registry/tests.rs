@@ -2,7 +2,7 @@
 
 use super::*;
 use crate::gpu::{Gpu, GpuOptions};
-use crate::{CommonOptions, ModelSpec, load, resume};
+use crate::{CommonOptions, ModelSpec, load, resume, test_scenes};
 use std::collections::BTreeSet;
 
 #[test]
@@ -38,9 +38,30 @@ fn untrained_model_of_every_method_is_resumed_saved_and_recognized() {
         let registered = kind.entry().files.iter().chain([&METADATA_FILE]).map(|file| (*file).to_owned());
         assert_eq!(written, registered.collect(), "{kind:?}");
         assert_eq!(ModelKind::of_saved(folder.path()).unwrap(), Some(*kind));
+        assert_eq!(load(gpu.clone(), folder.path()).unwrap().method.bounds().unwrap(), None);
         std::fs::remove_file(folder.path().join(METADATA_FILE)).unwrap();
         assert_eq!(ModelKind::of_saved(folder.path()).unwrap(), Some(*kind));
         assert_eq!(load(gpu.clone(), folder.path()).unwrap().method.bounds().unwrap(), None);
+    }
+}
+
+/// A live run deletes a removed keyframe with the next checkpoint.
+#[test]
+fn removed_keyframe_is_not_needed_to_resume() {
+    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let keyframes = test_scenes::ring(&[test_scenes::floor()], nalgebra::Point3::origin(), 4);
+    for kind in ModelKind::ALL {
+        let mut model = ModelSpec::new(*kind, CommonOptions::default(), &[]).unwrap().start(gpu.clone()).unwrap();
+        keyframes.iter().for_each(|keyframe| model.push(keyframe.clone()).unwrap());
+        while model.progress().step < 2 {
+            model.step(1).unwrap();
+        }
+        let n_steps = model.progress().step;
+        model.remove(&keyframes[0].camera, keyframes[0].stamp).unwrap();
+        assert_eq!(model.progress().step, n_steps, "{kind:?}");
+        let checkpoint = model.checkpoint().unwrap().finish().unwrap();
+        let resumed = resume(gpu.clone(), &checkpoint, &keyframes[1..]);
+        assert!(resumed.is_ok(), "{kind:?}: {:?}", resumed.err());
     }
 }
 

@@ -1,30 +1,37 @@
 //! Tests of training with alignment: the correction is applied to every camera, and resuming from a checkpoint is
 //! bit-exact.
 
-use super::training_tests::train;
-use super::{SplatOptions, SplatTrainer};
-use crate::Method;
+use super::{SplatOptions, SplatTrainer, ply};
 use crate::gpu::{Gpu, GpuOptions};
-use crate::model_options::{CommonOptions, ModelOptions};
+use crate::{Aligned, CommonOptions, Method, ModelOptions};
 use calibration::scenes::{Miscalibration, capture, remaining, wrong_extrinsics};
 use calibration::{CameraRefinement, ParamSet};
 use keyframe::{Keyframe, Split};
 use std::sync::Arc;
 
-fn new_trainer(gpu: &Arc<Gpu>, keyframes: &[Arc<Keyframe>]) -> SplatTrainer {
+const N_PLANNED_STEPS: u64 = 120;
+
+fn new_model(gpu: &Arc<Gpu>, keyframes: &[Arc<Keyframe>]) -> Aligned<SplatTrainer> {
     let common = CommonOptions {
-        align: CameraRefinement::Try(vec![ParamSet::EXTRINSICS]),
         cameras: CameraRefinement::Try(vec![ParamSet::IMAGE_POSES]),
-        n_planned_steps: 120,
+        n_planned_steps: N_PLANNED_STEPS,
         ..CommonOptions::default()
     };
     let specific =
         SplatOptions { max_splats: 2000, coarse_steps: Some([1000, 1000]), sh_degree: 0, ..SplatOptions::default() };
-    let mut trainer = SplatTrainer::new(gpu.clone(), ModelOptions { common, specific }).unwrap();
+    let align = CameraRefinement::Try(vec![ParamSet::EXTRINSICS]);
+    let trainer = SplatTrainer::new(gpu.clone(), ModelOptions { common, specific }).unwrap();
+    let mut model = Aligned::new(trainer, align, true, N_PLANNED_STEPS);
     for keyframe in keyframes {
-        trainer.push(keyframe.clone()).unwrap();
+        model.push(keyframe.clone()).unwrap();
     }
-    trainer
+    model
+}
+
+fn train_to(model: &mut dyn Method, step: u64) {
+    while model.progress().step != step {
+        model.step(1).unwrap();
+    }
 }
 
 #[test]
@@ -33,9 +40,9 @@ fn wrong_extrinsics_are_corrected_and_resuming_is_exact() {
     let gpu = Gpu::open(&GpuOptions::default()).unwrap();
     let miscalibration = Miscalibration { extrinsics: wrong_extrinsics(), ..Miscalibration::none() };
     let keyframes = capture(&miscalibration);
-    let mut uninterrupted = new_trainer(&gpu, &keyframes);
+    let mut uninterrupted = new_model(&gpu, &keyframes);
     // The step at which the result is applied is step 0 of the new model.
-    train(&mut uninterrupted, ALIGNMENT_STEP);
+    train_to(&mut uninterrupted, ALIGNMENT_STEP);
     assert!(uninterrupted.alignment().is_none());
     uninterrupted.step(1).unwrap();
     assert_eq!(uninterrupted.progress().step, 1, "training restarted");
@@ -44,32 +51,36 @@ fn wrong_extrinsics_are_corrected_and_resuming_is_exact() {
     assert!(degrees < 0.05 && mm < 0.5, "{degrees} degrees, {mm} mm");
     let test = keyframes.iter().find(|keyframe| keyframe.split == Split::Test).unwrap();
     assert_eq!(uninterrupted.calibrated_camera(test).unwrap(), correction.apply(test));
-    train(&mut uninterrupted, 9);
+    train_to(&mut uninterrupted, 10);
 
-    // Interrupted before and after the result is applied.
-    let mut interrupted = new_trainer(&gpu, &keyframes);
-    train(&mut interrupted, 10);
-    for n_steps in [21, 6, 3] {
+    // Interrupted before and after the result is applied. The keyframes are stored in another order than they arrived.
+    let mut stored = keyframes.clone();
+    stored.reverse();
+    let mut interrupted: Box<dyn Method> = Box::new(new_model(&gpu, &keyframes));
+    train_to(&mut *interrupted, 10);
+    for end in [1, 7, 10] {
         let checkpoint = interrupted.checkpoint().unwrap().finish().unwrap();
         let untrained;
-        (interrupted, untrained) = SplatTrainer::resume(gpu.clone(), &checkpoint, &keyframes).unwrap();
-        for keyframe in untrained {
+        (interrupted, untrained) =
+            Aligned::resume(&checkpoint, &stored, |own, keyframes| SplatTrainer::resume(gpu.clone(), own, keyframes))
+                .unwrap();
+        for keyframe in untrained.into_iter().rev() {
             interrupted.push(keyframe).unwrap();
         }
-        let end = if n_steps == 21 { 1 } else { interrupted.progress().step + n_steps };
-        while interrupted.progress().step != end {
-            interrupted.step(1).unwrap();
-        }
+        train_to(&mut *interrupted, end);
     }
-    assert_eq!(interrupted.progress().step, uninterrupted.progress().step);
-    assert_eq!(interrupted.alignment(), uninterrupted.alignment());
-    assert!(interrupted.arrays().unwrap() == uninterrupted.arrays().unwrap(), "splats differ");
+    let [one, other] = [&mut uninterrupted as &mut dyn Method, &mut *interrupted]
+        .map(|model| model.checkpoint().unwrap().finish().unwrap());
+    assert_eq!(one.state, other.state);
+    assert!(one.arrays == other.arrays, "arrays differ");
+    assert_eq!(uninterrupted.n_total_steps().unwrap(), ALIGNMENT_STEP + 10);
 
     // The saved model contains the correction, too.
     let folder = tempfile::tempdir().unwrap();
     uninterrupted.save(folder.path()).unwrap();
-    let arrays = uninterrupted.arrays().unwrap();
-    let loaded = SplatTrainer::from_arrays(gpu, ModelOptions::default(), &arrays).unwrap();
-    let mut loaded = loaded.with_saved_corrections(folder.path()).unwrap();
+    let arrays = ply::read(&folder.path().join("splats.ply")).unwrap();
+    let trainer = SplatTrainer::from_arrays(gpu, ModelOptions::default(), &arrays).unwrap();
+    let trainer = trainer.with_saved_corrections(folder.path()).unwrap();
+    let mut loaded = Aligned::load(trainer, folder.path()).unwrap();
     assert_eq!(loaded.calibrated_camera(test).unwrap(), correction.apply(test));
 }

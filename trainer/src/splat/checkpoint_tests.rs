@@ -128,8 +128,13 @@ fn other_data_and_unknown_states_are_rejected() {
     assert!(
         error_with_changed_checkpoint(&|other| other.state["future"] = 1.into()).contains("unknown field `future`")
     );
-    assert!(error_with_changed_checkpoint(&|other| other.state["n_splats"] = 4_000_000.into()).contains("do not fit"));
-    assert!(error_with_changed_checkpoint(&|other| other.state["active_degree"] = 3.into()).contains("do not fit"));
+    assert!(
+        error_with_changed_checkpoint(&|other| other.state["model"]["n_splats"] = 4_000_000.into())
+            .contains("do not fit")
+    );
+    assert!(
+        error_with_changed_checkpoint(&|other| other.state["model"]["active_degree"] = 3.into()).contains("do not fit")
+    );
     assert!(error_with_changed_checkpoint(&|other| other.state["unseeded"] = vec![99].into()).contains("view"));
     assert!(error_with_changed_checkpoint(&|other| other.arrays[2].bytes.truncate(1)).contains("\"shapes\" has"));
 }

@@ -5,8 +5,8 @@ use super::{SplatOptions, SplatTrainer};
 use crate::checkpoint::Checkpoint;
 use crate::gpu::Gpu;
 use crate::method_entry::{Export, ExportRequest, ExportWriter, Exported, MethodEntry, SingleFile};
-use crate::model_options::{MethodOptions, default_options};
-use crate::{Error, Method, ResumedModel};
+use crate::model_options::{MethodOptions, ModelOptions, default_options};
+use crate::{Aligned, Error, Method, ResumedModel};
 use calibration::ParamSet;
 use keyframe::Keyframe;
 use std::path::Path;
@@ -33,14 +33,20 @@ pub(crate) static ENTRY: MethodEntry = MethodEntry {
     ],
     default_options: default_options::<SplatOptions>,
     check_options: |options| options.typed::<SplatOptions>().map(drop),
-    start: |gpu, options| Ok(Box::new(SplatTrainer::new(gpu, options.typed()?)?)),
+    start,
     resume,
     load,
 };
 
+fn start(gpu: Arc<Gpu>, options: &ModelOptions) -> Result<Box<dyn Method>, Error> {
+    let model = SplatTrainer::new(gpu.clone(), options.typed()?)?;
+    Ok(Aligned::if_requested(model, &options.common, &gpu))
+}
+
 fn resume(gpu: Arc<Gpu>, checkpoint: &Checkpoint, keyframes: &[Arc<Keyframe>]) -> Result<ResumedModel, Error> {
-    let (model, untrained) = SplatTrainer::resume(gpu, checkpoint, keyframes)?;
-    Ok((Box::new(model), untrained))
+    Aligned::resume(checkpoint, keyframes, |own_checkpoint, keyframes| {
+        SplatTrainer::resume(gpu, own_checkpoint, keyframes)
+    })
 }
 
 fn load(gpu: Arc<Gpu>, model: &Path) -> Result<Box<dyn Method>, Error> {
@@ -49,7 +55,10 @@ fn load(gpu: Arc<Gpu>, model: &Path) -> Result<Box<dyn Method>, Error> {
     let max_splats = u32::try_from(splats.n_splats()).unwrap_or(u32::MAX);
     let options = SplatOptions { max_splats, ..SplatOptions::default() };
     let trainer = SplatTrainer::from_arrays(gpu, options.into(), &splats)?;
-    Ok(Box::new(if model.is_dir() { trainer.with_saved_corrections(model)? } else { trainer }))
+    Ok(match model.is_dir() {
+        true => Box::new(Aligned::load(trainer.with_saved_corrections(model)?, model)?),
+        false => Box::new(trainer),
+    })
 }
 
 fn write_ply(request: &ExportRequest<'_>) -> Result<Exported, Error> {

@@ -24,6 +24,7 @@ mod params;
 mod passes;
 pub mod ply;
 pub mod reference;
+mod schedule;
 mod seed;
 mod snapshot;
 pub mod spz;

@@ -3,6 +3,7 @@
 use super::buffers::{BLOCK, GROUP, ImageBuffers, Scratch, SplatBuffers, WINDOW_BINS, n_bins, n_tiles};
 use super::kernels::{DrawPipelines, Ssim, TrainPipelines};
 use super::params::{Growth, TILE_PX};
+use crate::Error;
 use crate::gpu::{Buffer, Gpu, Passes, Pipeline};
 
 /// Buffers that the passes of one view use.
@@ -38,6 +39,21 @@ pub(crate) struct GrowthBuffers {
     pub(crate) block_weights: Buffer,
     pub(crate) n_children: Buffer,
     pub(crate) parents: Buffer,
+}
+
+impl GrowthBuffers {
+    /// Allocates the buffers of a change.
+    pub(crate) fn new(gpu: &Gpu, growth: &Growth) -> Result<Self, Error> {
+        let words = |name: &str, n: u32| gpu.storage(name, 4 * u64::from(n));
+        Ok(Self {
+            growth: gpu.uniform_with("splat.growth", growth),
+            weights: words("splat.weights", growth.n_before)?,
+            cumulative: words("splat.cumulative", growth.n_before)?,
+            block_weights: words("splat.block_weights", growth.n_before.div_ceil(256))?,
+            n_children: words("splat.n_children", growth.n_before)?,
+            parents: words("splat.parents", growth.n_after)?,
+        })
+    }
 }
 
 /// Replaces dead splats by children of other splats and appends more children after `n_before`. Parents are chosen by

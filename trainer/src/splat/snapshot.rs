@@ -1,6 +1,7 @@
 //! The state of training that a rejected trial restores.
 
 use super::buffers::SplatBuffers;
+use super::schedule::Schedule;
 use super::seed::Seeder;
 use crate::gpu::Buffer;
 use calibration::ParamSet;
@@ -10,16 +11,23 @@ use calibration::ParamSet;
 pub(crate) struct Snapshot {
     pub(super) splats: SplatBuffers,
     pub(super) cameras: (ParamSet, Buffer),
-    pub(super) step: u64,
-    pub(super) last_growth_step: u64,
-    pub(super) seeding: Seeding,
+    pub(super) schedule: Schedule,
+    pub(super) scene: ObservedScene,
 }
 
-/// State that an arriving keyframe changes: seeded positions, and the scale and schedule of training.
+/// What the keyframes so far show of the scene.
 #[derive(Clone, Debug)]
-pub(crate) struct Seeding {
+pub(crate) struct ObservedScene {
+    /// Positions that have splats.
     pub(super) seeder: Seeder,
-    pub(super) scene_size_m: f64,
+    /// Scale of the scene.
+    pub(super) size_m: f64,
+    /// Whether any keyframe has depth.
     pub(super) has_depth: bool,
-    pub(super) schedule_start: u64,
+}
+
+impl Default for ObservedScene {
+    fn default() -> Self {
+        Self { seeder: Seeder::default(), size_m: 1.0, has_depth: false }
+    }
 }

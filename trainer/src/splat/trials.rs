@@ -8,9 +8,11 @@
 //! loss of all reductions is at most [`MAX_TOTAL_LOSS_DB`]. After the last trial, the validation keyframes become
 //! training keyframes.
 
+use super::buffers::SplatBuffers;
 use super::snapshot::Snapshot;
-use crate::gpu::Buffer;
-use calibration::{CameraRefinement, Candidate, ParamSet, Trial};
+use crate::Error;
+use crate::gpu::{Buffer, Gpu};
+use calibration::{CameraRefinement, Candidate, MIN_VALIDATION_IMAGES, ParamSet, Trial};
 use keyframe::Keyframe;
 use kinematics::Stamp;
 use serde::{Deserialize, Serialize};
@@ -26,8 +28,6 @@ const STEPS_PER_IMAGE: u64 = 4;
 const MAX_STEPS: u64 = 1200;
 /// Maximum total loss of all accepted reductions, dB.
 const MAX_TOTAL_LOSS_DB: f64 = 0.15;
-/// Minimum number of validation keyframes for a trial.
-const MIN_VALIDATION_IMAGES: usize = 4;
 /// Maximum number of validation keyframes in a mean score.
 pub(crate) const MAX_SCORED: usize = 24;
 /// The number of splats is not halved further below this value.
@@ -51,6 +51,17 @@ pub enum CountPolicy {
 pub(crate) struct ValidationImage {
     pub(crate) keyframe: Arc<Keyframe>,
     pub(crate) image: Option<Buffer>,
+}
+
+impl ValidationImage {
+    /// The image on the GPU.
+    pub(crate) fn uploaded(&mut self, gpu: &Gpu) -> Result<&Buffer, Error> {
+        let image = match self.image.take() {
+            Some(image) => image,
+            None => gpu.storage_with("splat.validation", &self.keyframe.rgba_srgb)?,
+        };
+        Ok(self.image.insert(image))
+    }
 }
 
 /// Camera and stamp of a keyframe.
@@ -97,19 +108,15 @@ pub(crate) struct SplatTrials {
     degree: u32,
     pub(crate) validation: Vec<ValidationImage>,
     pub(crate) finished: Vec<Trial>,
+    /// Optimizer updates that were reverted.
+    pub(crate) n_reverted_steps: u64,
     trial_phase: SplatTrialPhase,
 }
 
 #[derive(Debug)]
 enum SplatTrialPhase {
     Waiting,
-    Baseline(RunningTrial),
-    Variant {
-        trial: RunningTrial,
-        baseline_db: Scores,
-        /// Keyframes that wait for the end of the trial.
-        deferred: Vec<Arc<Keyframe>>,
-    },
+    Running(RunningTrial),
     Finished,
 }
 
@@ -126,6 +133,10 @@ pub(crate) struct RunningTrial {
     pub(crate) scored: Vec<ImageId>,
     /// In the first half, the keyframes that arrived; in the second half, those that have not arrived again yet.
     pub(crate) arrivals: VecDeque<Arrival>,
+    /// Scores at the end of the first half, which trains the baseline.
+    pub(crate) baseline_db: Option<Scores>,
+    /// Keyframes that arrived in the second half and wait for its end.
+    pub(crate) deferred: Vec<Arc<Keyframe>>,
 }
 
 /// Work to do at the start of the second half of a trial.
@@ -147,9 +158,6 @@ pub(crate) struct TrialEnd {
     /// Keyframes to add now.
     pub(crate) deferred: Vec<Arc<Keyframe>>,
 }
-
-/// A trial in progress, for a checkpoint; in the second half, with the scores of the first.
-pub(crate) type RunningTrialRef<'a> = (&'a RunningTrial, Option<&'a Scores>);
 
 /// The remaining candidates.
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -191,19 +199,45 @@ pub(crate) struct TrialContext {
     pub(crate) sh_degree: u32,
 }
 
+impl RunningTrial {
+    /// Whether the variant is in training.
+    fn is_second_half(&self) -> bool {
+        self.baseline_db.is_some()
+    }
+
+    /// Step at which a keyframe arrives again.
+    fn next_arrival_step(&self) -> u64 {
+        self.arrivals.front().filter(|_| self.is_second_half()).map_or(u64::MAX, |next_due| next_due.step)
+    }
+
+    fn due(&self, step: u64) -> Due {
+        match (step >= self.until, self.is_second_half()) {
+            _ if step >= self.next_arrival_step() => Due::Arrival,
+            (false, _) => Due::Nothing,
+            (true, false) => Due::BeginSecondHalf,
+            (true, true) => Due::End,
+        }
+    }
+}
+
 impl SplatTrials {
     pub(crate) fn new(cameras: &CameraRefinement, count: CountPolicy) -> Self {
-        let candidates: VecDeque<ParamSet> = match cameras {
-            CameraRefinement::Always(_) => VecDeque::new(),
-            CameraRefinement::Try(candidates) => candidates.iter().copied().collect(),
-        };
+        let candidates: VecDeque<ParamSet> = cameras.candidates().iter().copied().collect();
         let count = match count {
             CountPolicy::ToCap => CountState::ToCap,
             CountPolicy::Tested => CountState::Growing,
         };
         let is_finished = candidates.is_empty() && count == CountState::ToCap;
         let trial_phase = if is_finished { SplatTrialPhase::Finished } else { SplatTrialPhase::Waiting };
-        Self { candidates, count, degree: 0, validation: Vec::new(), finished: Vec::new(), trial_phase }
+        Self {
+            candidates,
+            count,
+            degree: 0,
+            validation: Vec::new(),
+            finished: Vec::new(),
+            n_reverted_steps: 0,
+            trial_phase,
+        }
     }
 
     /// Whether validation keyframes are still excluded from training.
@@ -213,31 +247,20 @@ impl SplatTrials {
 
     /// Whether splats may be added.
     pub(crate) fn may_grow(&self) -> bool {
-        let is_halving =
-            matches!(self.running_trial(), Some((RunningTrial { candidate: Candidate::Halved { .. }, .. }, _)));
+        let is_halving = matches!(self.running_trial(), Some(RunningTrial { candidate: Candidate::Halved { .. }, .. }));
         matches!(self.count, CountState::ToCap | CountState::Growing) && !is_halving
     }
 
     /// The trial in progress.
-    pub(crate) fn running_trial(&self) -> Option<RunningTrialRef<'_>> {
-        match &self.trial_phase {
-            SplatTrialPhase::Baseline(trial) => Some((trial, None)),
-            SplatTrialPhase::Variant { trial, baseline_db, .. } => Some((trial, Some(baseline_db))),
-            SplatTrialPhase::Waiting | SplatTrialPhase::Finished => None,
-        }
+    pub(crate) fn running_trial(&self) -> Option<&RunningTrial> {
+        if let SplatTrialPhase::Running(trial) = &self.trial_phase { Some(trial) } else { None }
     }
 
     pub(crate) fn due(&self, context: TrialContext) -> Due {
         match &self.trial_phase {
             SplatTrialPhase::Waiting => self.next_due(context),
-            SplatTrialPhase::Baseline(trial) if context.step >= trial.until => Due::BeginSecondHalf,
-            SplatTrialPhase::Variant { trial, .. }
-                if trial.arrivals.front().is_some_and(|next_due| context.step >= next_due.step) =>
-            {
-                Due::Arrival
-            }
-            SplatTrialPhase::Variant { trial, .. } if context.step >= trial.until => Due::End,
-            SplatTrialPhase::Baseline(_) | SplatTrialPhase::Variant { .. } | SplatTrialPhase::Finished => Due::Nothing,
+            SplatTrialPhase::Running(trial) => trial.due(context.step),
+            SplatTrialPhase::Finished => Due::Nothing,
         }
     }
 
@@ -268,43 +291,33 @@ impl SplatTrials {
     pub(crate) fn steps_left(&self, step: u64) -> u64 {
         match &self.trial_phase {
             SplatTrialPhase::Waiting if step < TRIAL_START => TRIAL_START - step,
-            SplatTrialPhase::Baseline(trial) => trial.until.saturating_sub(step).max(1),
-            SplatTrialPhase::Variant { trial, .. } => {
-                let arrives_at = trial.arrivals.front().map_or(u64::MAX, |next_due| next_due.step);
-                trial.until.min(arrives_at).saturating_sub(step).max(1)
-            }
+            SplatTrialPhase::Running(trial) => trial.until.min(trial.next_arrival_step()).saturating_sub(step).max(1),
             _ => u64::MAX,
         }
     }
 
     /// Records a training keyframe that arrives at this step. Returns whether it must wait for the end of a trial.
     pub(crate) fn defer_arrival(&mut self, keyframe: &Arc<Keyframe>, step: u64) -> bool {
-        match &mut self.trial_phase {
-            SplatTrialPhase::Baseline(trial) => {
-                trial.arrivals.push_back(Arrival { step, keyframe: keyframe.clone() });
-                false
-            }
-            SplatTrialPhase::Variant { deferred, .. } => {
-                deferred.push(keyframe.clone());
-                true
-            }
-            SplatTrialPhase::Waiting | SplatTrialPhase::Finished => false,
+        let SplatTrialPhase::Running(trial) = &mut self.trial_phase else { return false };
+        let is_deferred = trial.is_second_half();
+        match is_deferred {
+            true => trial.deferred.push(keyframe.clone()),
+            false => trial.arrivals.push_back(Arrival { step, keyframe: keyframe.clone() }),
         }
+        is_deferred
     }
 
     /// Next keyframe to add in the second half of a trial.
     pub(crate) fn next_arrival(&mut self) -> Option<Arc<Keyframe>> {
-        match &mut self.trial_phase {
-            SplatTrialPhase::Variant { trial, .. } => trial.arrivals.pop_front().map(|arrival| arrival.keyframe),
-            _ => None,
-        }
+        let SplatTrialPhase::Running(trial) = &mut self.trial_phase else { return None };
+        trial.arrivals.pop_front().map(|arrival| arrival.keyframe)
     }
 
     /// The validation keyframes to score: those of the trial in progress, or else a subset spread evenly over all.
     pub(crate) fn scored(&self) -> Vec<ImageId> {
         let stride = self.validation.len().div_ceil(MAX_SCORED).max(1);
         let spread = || self.validation.iter().step_by(stride).map(|validation| id_of(&validation.keyframe)).collect();
-        self.running_trial().map_or_else(spread, |(trial, _)| trial.scored.clone())
+        self.running_trial().map_or_else(spread, |trial| trial.scored.clone())
     }
 
     /// A validation keyframe, unless it was removed.
@@ -322,43 +335,34 @@ impl SplatTrials {
             }
             _ => SHARED_STEPS,
         };
-        let until = from.step + n_steps;
+        let until = from.schedule.step + n_steps;
         let scored = self.scored();
-        self.trial_phase = SplatTrialPhase::Baseline(RunningTrial {
+        self.trial_phase = SplatTrialPhase::Running(RunningTrial {
             candidate,
             until,
             other: Box::new(from),
             scored,
             arrivals: VecDeque::new(),
+            baseline_db: None,
+            deferred: Vec::new(),
         });
     }
 
     /// Starts the second half.
     pub(crate) fn begin_second_half(&mut self, baseline: Snapshot, baseline_db: Scores) -> Option<SecondHalf> {
-        match std::mem::replace(&mut self.trial_phase, SplatTrialPhase::Finished) {
-            SplatTrialPhase::Baseline(mut trial) => {
-                let from = *std::mem::replace(&mut trial.other, Box::new(baseline));
-                let arrived = trial.arrivals.iter().map(|arrival| arrival.keyframe.clone()).collect();
-                let candidate = trial.candidate;
-                self.trial_phase = SplatTrialPhase::Variant { trial, baseline_db, deferred: Vec::new() };
-                Some(SecondHalf { from, candidate, arrived })
-            }
-            other => {
-                self.trial_phase = other;
-                None
-            }
-        }
+        let SplatTrialPhase::Running(trial) = &mut self.trial_phase else { return None };
+        trial.baseline_db = Some(baseline_db);
+        Some(SecondHalf {
+            from: std::mem::replace(&mut *trial.other, baseline),
+            candidate: trial.candidate,
+            arrived: trial.arrivals.iter().map(|arrival| arrival.keyframe.clone()).collect(),
+        })
     }
 
     /// Accepts or rejects the change.
     pub(crate) fn end(&mut self, variant_db: &Scores) -> Option<TrialEnd> {
-        let SplatTrialPhase::Variant { trial, baseline_db, deferred } =
-            std::mem::replace(&mut self.trial_phase, SplatTrialPhase::Waiting)
-        else {
-            return None;
-        };
-        let (baseline_db, variant_db) = pair_scores(&baseline_db, variant_db);
-        let candidate = trial.candidate;
+        let RunningTrial { candidate, other, baseline_db, deferred, .. } = self.take_second_half()?;
+        let (baseline_db, variant_db) = pair_scores(&baseline_db?, variant_db);
         let kept = self.evaluate(candidate, &baseline_db, &variant_db);
         match candidate {
             Candidate::Cameras(_) => drop(self.candidates.pop_front()),
@@ -366,7 +370,7 @@ impl SplatTrials {
             Candidate::Halved { .. } => self.count = CountState::Finished,
             Candidate::ShDegree { from, to } => self.degree = if kept { from } else { to + 1 },
         }
-        Some(TrialEnd { restored: (!kept).then_some(*trial.other), seeded: Vec::new(), deferred })
+        Some(TrialEnd { restored: (!kept).then_some(*other), seeded: Vec::new(), deferred })
     }
 
     /// Decides on per-image gains. Returns them if they are significant.
@@ -389,12 +393,15 @@ impl SplatTrials {
 
     /// Cancels the trial in progress; it is repeated if training continues.
     pub(crate) fn cancel(&mut self) -> Option<TrialEnd> {
+        let RunningTrial { other, arrivals, deferred, .. } = self.take_second_half()?;
+        let seeded = arrivals.into_iter().map(|arrival| arrival.keyframe).collect();
+        Some(TrialEnd { restored: Some(*other), seeded, deferred })
+    }
+
+    /// Ends a trial in its second half.
+    fn take_second_half(&mut self) -> Option<RunningTrial> {
         match std::mem::replace(&mut self.trial_phase, SplatTrialPhase::Waiting) {
-            SplatTrialPhase::Variant { trial, deferred, .. } => Some(TrialEnd {
-                restored: Some(*trial.other),
-                seeded: trial.arrivals.into_iter().map(|arrival| arrival.keyframe).collect(),
-                deferred,
-            }),
+            SplatTrialPhase::Running(trial) if trial.is_second_half() => Some(trial),
             other => {
                 self.trial_phase = other;
                 None
@@ -410,10 +417,12 @@ impl SplatTrials {
 
     /// The state without the change, during the second half of a trial.
     pub(crate) fn baseline(&self) -> Option<&Snapshot> {
-        match &self.trial_phase {
-            SplatTrialPhase::Variant { trial, .. } => Some(&trial.other),
-            _ => None,
-        }
+        self.running_trial().filter(|trial| trial.is_second_half()).map(|trial| &*trial.other)
+    }
+
+    /// The splats that viewers see: during a trial, those without the change.
+    pub(crate) fn displayed<'a>(&'a self, in_training: &'a SplatBuffers) -> &'a SplatBuffers {
+        self.baseline().map_or(in_training, |snapshot| &snapshot.splats)
     }
 
     /// State for a checkpoint, except for a trial in progress.
@@ -434,12 +443,9 @@ impl SplatTrials {
         (self.count, self.degree, self.finished) = (remaining_trials.count, remaining_trials.degree, finished);
     }
 
-    /// Restores a trial from a checkpoint; it is in its second half if there are scores of the first.
-    pub(crate) fn restore_trial(&mut self, trial: RunningTrial, baseline_db: Option<Scores>) {
-        self.trial_phase = match baseline_db {
-            Some(baseline_db) => SplatTrialPhase::Variant { trial, baseline_db, deferred: Vec::new() },
-            None => SplatTrialPhase::Baseline(trial),
-        };
+    /// Restores a trial from a checkpoint.
+    pub(crate) fn restore_trial(&mut self, trial: RunningTrial) {
+        self.trial_phase = SplatTrialPhase::Running(trial);
     }
 
     /// Removes a candidate that was accepted without a trial. Returns whether it was a candidate.
@@ -452,13 +458,9 @@ impl SplatTrials {
     /// Removes a keyframe.
     pub(crate) fn remove(&mut self, is_removed: impl Fn(&Keyframe) -> bool) {
         self.validation.retain(|validation| !is_removed(&validation.keyframe));
-        match &mut self.trial_phase {
-            SplatTrialPhase::Baseline(trial) => trial.arrivals.retain(|arrival| !is_removed(&arrival.keyframe)),
-            SplatTrialPhase::Variant { trial, deferred, .. } => {
-                trial.arrivals.retain(|arrival| !is_removed(&arrival.keyframe));
-                deferred.retain(|keyframe| !is_removed(keyframe));
-            }
-            SplatTrialPhase::Waiting | SplatTrialPhase::Finished => {}
+        if let SplatTrialPhase::Running(trial) = &mut self.trial_phase {
+            trial.arrivals.retain(|arrival| !is_removed(&arrival.keyframe));
+            trial.deferred.retain(|keyframe| !is_removed(keyframe));
         }
     }
 }

@@ -20,3 +20,10 @@ pub(crate) struct Capacity {
 pub(crate) fn max_blocks(gpu: &Gpu) -> u32 {
     u32::try_from(gpu.max_binding_bytes() / (8 * N_VOXELS as u64)).unwrap_or(u32::MAX).max(1)
 }
+
+/// Maximum number of blocks that the adapter can bind and that fit into `max_bytes` together with the table.
+pub(crate) fn max_blocks_within(gpu: &Gpu, max_bytes: Option<u64>, n_chunks: u32) -> u32 {
+    let table_bytes = u64::from(n_chunks) * BYTES_PER_CHUNK;
+    let by_bytes = max_bytes.map_or(u64::MAX, |bytes| bytes.saturating_sub(table_bytes) / BYTES_PER_BLOCK);
+    max_blocks(gpu).min(u32::try_from(by_bytes).unwrap_or(u32::MAX)).max(1)
+}

@@ -108,7 +108,10 @@ export interface PictureHeader {
   projection: Pinhole | { kind: "equirectangular" };
   near_m: number;
   far_m: number;
+  waited_millis: number;
   render_millis: number;
+  encode_millis: number | null;
+  keyframes: number | null;
   color: { format: "jpeg"; offset: number; bytes: number } | null;
   depth: {
     format: "u16_half" | "f32";

@@ -6,19 +6,19 @@ use crate::wire::can::mit::{Command, Limits, Motion};
 const INERTIA_KG_M2: f64 = 0.05;
 /// Viscous friction, N m s / rad.
 const FRICTION_NM_S_RAD: f64 = 0.25;
-/// Gain with which a drive's position loop approaches its target, 1 / s, and its maximum velocity, rad / s.
+/// Gain of the drive's position loop, 1 / s. The next constant is the maximum velocity of the loop, rad / s.
 const FOLLOWING_HZ: f64 = 60.0;
 const MAX_FOLLOWING_RAD_S: f64 = 40.0;
 /// Deceleration of the quick-stop ramp, rad / s2.
 const QUICK_STOP_RAD_S2: f64 = 30.0;
 /// Maximum length of a simulation step, s.
 const STEP_SECS: f64 = 2.5e-4;
-/// Maximum time to simulate at once, s; after a longer stall the rest is skipped.
+/// Maximum time to simulate at once, s. After a longer stall, the rest is skipped.
 const MAX_SECS: f64 = 1.0;
 
-/// What a drive does with its shaft.
+/// Action of a drive on its shaft.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) enum Actuation {
+pub(in crate::can) enum Actuation {
     /// Releases it.
     Free,
     /// Applies the torque law of MIT mode.

@@ -14,7 +14,7 @@ const MAX_RAD: f64 = 10.0;
 pub(crate) const VERSIONS: [FciVersion; 2] = [FciVersion::V5, FciVersion::V10];
 
 /// Decodes concatenated datagrams, a millisecond apart. Each is preceded by its length in two bytes, little-endian.
-/// All are decoded in both FCI versions, as they are and padded to the length of a state.
+/// Each datagram is decoded in both FCI versions, both unchanged and padded to the length of a state.
 ///
 /// Checks that the stamps of the resulting states increase and that their positions are plausible angles.
 pub fn states(bytes: &[u8]) {

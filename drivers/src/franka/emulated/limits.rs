@@ -5,7 +5,8 @@ use super::CommandedJoints;
 
 /// Seconds between commands.
 pub(super) const STEP_SECS: f64 = 1e-3;
-/// Positions are rounded to 4e-16 rad; the third difference of eight such roundings over (1 ms)³ is 3e-6 rad/s³.
+/// Tolerance for rounding. Positions are rounded to 4e-16 rad; the third difference of eight such roundings over (1
+/// ms)³ is 3e-6 rad/s³.
 const ROUNDING: f64 = 1e-5;
 
 /// Limits of the joints of one robot.
@@ -23,7 +24,7 @@ pub struct Limits {
     pub braking: Option<[BrakingLimit; N_JOINTS]>,
 }
 
-/// Near the end of its range a joint must be slow enough to stop with `deceleration_rad_s2`:
+/// Velocity limit near the end of a joint's range. The joint must be slow enough to stop with `deceleration_rad_s2`:
 /// `velocity <= sqrt(2 * deceleration * remaining distance) - margin`.
 ///
 /// Source: libfranka 0.21.2, `joint_velocity_limits.h`.
@@ -58,7 +59,7 @@ impl Violation {
 }
 
 impl Limits {
-    /// The Panda's. Source: `franka_description` and the FCI documentation of libfranka 0.9.2.
+    /// Limits of the Panda. Source: `franka_description` and the FCI documentation of libfranka 0.9.2.
     pub fn panda() -> Self {
         Self {
             position_rad: [
@@ -77,7 +78,7 @@ impl Limits {
         }
     }
 
-    /// The FR3's. Source: `franka_description` and `rate_limiting.h` of libfranka 0.21.2.
+    /// Limits of the FR3. Source: `franka_description` and `rate_limiting.h` of libfranka 0.21.2.
     pub fn fr3() -> Self {
         let braking = |(deceleration_rad_s2, margin_rad_s)| BrakingLimit { deceleration_rad_s2, margin_rad_s };
         let braking =
@@ -113,7 +114,7 @@ impl Limits {
         [-towards(position_rad - min), towards(max - position_rad)]
     }
 
-    /// Checks the step from the previous commanded joints to the current ones.
+    /// Checks the step from the previous commanded joint states to the current ones.
     pub(super) fn check(&self, before: &CommandedJoints, now: &CommandedJoints) -> Result<(), Violation> {
         let exceeds = |number: f64, max_rate: f64| number.is_nan() || number.abs() > max_rate + ROUNDING;
         for ix in 0..N_JOINTS {

@@ -32,7 +32,7 @@ pub(super) enum Setting {
     Filters,
 }
 
-/// Motion command of a client in answer to one state.
+/// Motion command with which a client answers one state.
 pub(super) struct Command {
     pub(super) number: u64,
     pub(super) position_rad: [f64; N_JOINTS],

@@ -4,11 +4,11 @@
 //! `message` and `state` encode and decode, `server` has the sockets. A callback of the owner, such as a simulator or
 //! a test, returns the actual joint states once per millisecond.
 //!
-//! It was written from the same documents as the driver. Tests with libfranka itself and with an independent server
-//! show that both interpret them correctly.
+//! The emulated controller was written from the same documents as the driver. Tests with libfranka and with an
+//! independent server show that both interpret these documents correctly.
 //!
-//! It accepts joint position and joint velocity motions, and rejects Cartesian and torque motions. Of the collision
-//! thresholds it evaluates only the joint torques.
+//! It accepts joint position and joint velocity motions, and rejects Cartesian and torque motions. It evaluates only
+//! the collision thresholds of joint torques.
 
 mod limits;
 mod message;
@@ -51,11 +51,11 @@ pub struct Joints {
     pub velocity_rad_s: [f64; N_JOINTS],
     /// Torques measured at the links, including gravity, Nm.
     pub torque_nm: [f64; N_JOINTS],
-    /// External torques (contacts) included in them, Nm.
+    /// External torques (contacts) that are included in `torque_nm`, Nm.
     pub external_torque_nm: [f64; N_JOINTS],
 }
 
-/// Commanded joint states at one instant; the last ones while no motion is active.
+/// Commanded joint states at one instant. While no motion is active, they keep the last values.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct CommandedJoints {
     /// Angles, rad.
@@ -68,6 +68,6 @@ pub struct CommandedJoints {
     pub is_moving: bool,
 }
 
-/// Callback that returns the actual joint states. It is called once per millisecond, in order, with the commanded
-/// ones.
+/// Callback that returns the actual joint states. It is called once per millisecond, in order, with the commanded joint
+/// states.
 pub type JointSimulator = Box<dyn FnMut(Stamp, &CommandedJoints) -> Joints + Send>;

@@ -1,4 +1,5 @@
-//! The controller's behavior: answers requests, follows motions within their limits, triggers reflexes, recovers.
+//! The behavior of the controller: it answers requests, follows motions within their limits, triggers reflexes and
+//! recovers.
 
 use super::super::N_JOINTS;
 use super::super::state::pose;
@@ -20,8 +21,8 @@ const MAX_MISSED: u32 = 20;
 const MAX_UNTIL_FIRST: u32 = 1000;
 /// Number of states over which the success rate is computed.
 const N_SUCCESS_WINDOW: usize = 100;
-/// Maximum deviation of a robot at rest from its commanded position. A greater one means that it was moved by hand; the
-/// commanded position then follows.
+/// Maximum deviation of a robot at rest from its commanded position. A greater deviation means that the robot was moved
+/// by hand; the commanded position then follows it.
 const MAX_SAG_RAD: f64 = 0.01;
 /// External torques that end a motion, until a client sets other thresholds, Nm.
 const DEFAULT_CONTACT_NM: f64 = 20.0;
@@ -78,7 +79,7 @@ impl Robot {
         }
     }
 
-    /// Executes a request other than connecting, and returns the replies; ending a motion gives two.
+    /// Executes a request other than connecting, and returns the replies. Ending a motion gives two replies.
     pub(super) fn answer(&mut self, request: Request, command: u32, command_id: u32, payload: &[u8]) -> Vec<Reply> {
         let is_moving = matches!(self.mode, Mode::Move(_));
         let mut replies = Vec::new();
@@ -168,8 +169,8 @@ impl Robot {
         v10::GetterSetterStatus::Success
     }
 
-    /// Advances the motion by a millisecond: with the client's answer to the newest state, or by extrapolation
-    /// without one.
+    /// Advances the motion by a millisecond, with the client's answer to the newest state, or by extrapolation if there
+    /// is none.
     ///
     /// `could_answer` is false if the client had no chance to answer because the emulator itself was late.
     pub(super) fn follow(&mut self, command: Option<&Command>, could_answer: bool) -> Option<Reply> {
@@ -207,7 +208,7 @@ impl Robot {
             self.mode = Mode::Move(Motion { has_begun: true, n_missed: 0, ..motion });
             return None;
         }
-        // From here on the joints stand still.
+        // From here on, the joints are at rest.
         let can_stop = |(velocity, max): (f64, f64)| velocity.abs() <= max * STEP_SECS;
         match now.velocity_rad_s.into_iter().zip(self.config.limits.acceleration_rad_s2).all(can_stop) {
             true => self.end(MoveStatus::Success),
@@ -229,13 +230,13 @@ impl Robot {
         if has_contact { self.trigger_reflex("joint_reflex") } else { None }
     }
 
-    /// The client disconnected.
+    /// Handles the disconnection of the client.
     pub(super) fn abandon(&mut self) {
         // No client is left to receive the reply.
         let _ = self.end(MoveStatus::Aborted);
     }
 
-    /// Fraction of the last states of a motion that were answered in time, 0 to 1; 0 if there is none.
+    /// Fraction of the last states of a motion that were answered in time, 0 to 1; 0 without a motion.
     pub(super) fn success_frac(&self) -> f64 {
         let n_answered = self.answered.iter().filter(|is_answered| **is_answered).count();
         n_answered as f64 / self.answered.len().max(1) as f64
@@ -274,7 +275,7 @@ impl Robot {
     }
 }
 
-/// Commanded joints a millisecond later. `rate` returns the velocity for a joint index and position.
+/// Commanded joint states a millisecond later. `rate` returns the velocity for a joint index and position.
 fn next_commanded(before: &CommandedJoints, rate: impl Fn(usize, f64) -> f64) -> CommandedJoints {
     let velocity_rad_s: [f64; N_JOINTS] = std::array::from_fn(|ix| rate(ix, before.position_rad[ix]));
     CommandedJoints {

@@ -21,7 +21,7 @@ use std::time::Duration;
 
 /// Interval between states.
 const STEP: Duration = Duration::from_millis(1);
-/// If the thread was not woken in time, states up to this lag are sent late; longer gaps are skipped.
+/// Maximum lag of the thread. States with a smaller lag are sent late; states with a larger lag are skipped.
 const MAX_LAG: Duration = Duration::from_millis(100);
 /// Maximum message size. Real clients stay far below it.
 const MAX_MESSAGE_BYTES: usize = 1 << 16;
@@ -37,7 +37,7 @@ pub struct EmulatedRobot {
 }
 
 impl EmulatedRobot {
-    /// Starts listening. From now on `joint_simulator` is asked for the joint states.
+    /// Starts listening. From then on, `joint_simulator` is called for the joint states.
     pub fn start(config: RobotConfig, mut joint_simulator: JointSimulator) -> Result<Self, Error> {
         let device = "emulated robot".to_owned();
         let n = config.chain.n_joints();
@@ -111,7 +111,7 @@ impl Server {
         realtime::request_realtime("emulated robot");
         let start_time = clock::now();
         let mut n_steps: u32 = 0;
-        // Start as if the robot had been on for a while.
+        // The numbers start as if the robot had been on for a while.
         let mut number = 1_000_000;
         while !self.stop.load(Ordering::Relaxed) {
             let due = start_time + STEP * n_steps;

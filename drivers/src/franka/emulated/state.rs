@@ -1,11 +1,10 @@
 //! Encodes the state of an emulated robot as a datagram.
 
 use super::super::N_JOINTS;
-use super::super::state::columns;
 use super::robot::{Mode, Motion, Robot, TrajectoryGenerator};
 use franka::FciVersion;
 use franka::wire::robot::{v5, v10};
-use kinematics::Transform;
+use kinematics::{Transform, transform};
 use zerocopy::IntoBytes;
 use zerocopy::little_endian::{F32, F64, U64};
 
@@ -82,6 +81,12 @@ impl Robot {
     fn base_from_flange(&self, position_rad: &[f64; N_JOINTS]) -> Transform {
         self.config.chain.forward(position_rad).expect("the chain was checked to have seven joints")
     }
+}
+
+/// Matrix of a pose in column-major order.
+fn columns(pose: &Transform) -> [f64; 16] {
+    let rows = transform::to_rows(pose);
+    std::array::from_fn(|at| rows[(at % 4) * 4 + at / 4])
 }
 
 /// A number of a state: FCI 5 sends doubles, FCI 10 floats.

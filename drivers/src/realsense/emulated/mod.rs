@@ -1,5 +1,5 @@
-//! Emulates a RealSense camera by writing a file. A software device of the library is recorded by the library itself,
-//! so the file has the same format as any other recording.
+//! Emulates a RealSense camera by writing a file. librealsense2 itself records one of its software devices, so the file
+//! has the same format as any other recording.
 
 #![expect(unsafe_code, reason = "FFI to a C library")]
 
@@ -19,8 +19,8 @@ use std::ptr::NonNull;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
-/// Maximum number of images that the library still has to write. We wait for it because it drops images that it cannot
-/// store.
+/// Maximum number of images that the library still has to write. If there are more, we wait, because the library drops
+/// images that it cannot store.
 const MAX_QUEUED_IMAGES: usize = 16;
 /// If no image is written for this long, the disk is assumed to be full or disconnected.
 const MAX_WAIT: Duration = Duration::from_secs(30);

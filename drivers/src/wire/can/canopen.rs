@@ -33,11 +33,11 @@ impl Node {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 pub enum Nmt {
-    /// Operational: send and accept PDOs.
+    /// Enter the operational state: send and accept PDOs.
     Start = 0x01,
-    /// Stopped: only heartbeats and NMT commands.
+    /// Enter the stopped state: only heartbeats and NMT commands.
     Stop = 0x02,
-    /// Pre-operational: SDOs but no PDOs.
+    /// Enter the pre-operational state: SDOs but no PDOs.
     EnterPreOperational = 0x80,
     /// Restart the node.
     ResetNode = 0x81,
@@ -51,11 +51,11 @@ pub enum Nmt {
 pub enum NodeState {
     /// The node has just started.
     BootUp = 0x00,
-    /// Only heartbeats and NMT commands.
+    /// The node handles only heartbeats and NMT commands.
     Stopped = 0x04,
     /// The node sends and accepts PDOs.
     Operational = 0x05,
-    /// SDOs but no PDOs.
+    /// The node handles SDOs but no PDOs.
     PreOperational = 0x7F,
 }
 
@@ -126,7 +126,7 @@ impl Pdo {
 }
 
 impl Object {
-    /// Its entry in a PDO mapping: index, subindex, length in bits.
+    /// The entry of this object in a PDO mapping: index, subindex, length in bits.
     pub fn mapped(self) -> u32 {
         u32::from(self.index) << 16 | u32::from(self.subindex) << 8 | (8 * u32::from(self.n_bytes))
     }
@@ -141,8 +141,8 @@ impl Object {
     }
 }
 
-/// The value of [`CONSUMER_HEARTBEAT`] with which a drive reacts after `millis` without a heartbeat of `host`; 0
-/// disables this.
+/// The value of [`CONSUMER_HEARTBEAT`] that makes a drive react after `millis` without a heartbeat from `host`; 0
+/// disables the reaction.
 pub fn consumer_heartbeat(host: Node, millis: u16) -> u32 {
     u32::from(host.0) << 16 | u32::from(millis)
 }
@@ -157,7 +157,7 @@ pub fn encode_sync() -> Frame {
     data_frame(0x80, &[])
 }
 
-/// Encodes a heartbeat: the host's own, without which drives stop, or that of an emulated node.
+/// Encodes a heartbeat: that of the host, without which drives stop, or that of an emulated node.
 pub fn encode_heartbeat(node: Node, state: NodeState) -> Frame {
     data_frame(0x700 + u32::from(node.0), &[state as u8])
 }

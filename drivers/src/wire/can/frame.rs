@@ -11,7 +11,7 @@ const FD_LENGTHS: [usize; 7] = [12, 16, 20, 24, 32, 48, 64];
 /// Acknowledge slot and delimiter, end of frame, and interframe space.
 const TAIL_BITS: u32 = 2 + 7 + 3;
 
-/// Identifier of a frame. Lower ones have priority on the bus.
+/// CAN ID of a frame. Frames with lower IDs have priority on the bus.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct Id {
     value: u32,
@@ -159,21 +159,21 @@ impl Frame {
     }
 }
 
-/// Stuff bits to count in addition to an FD frame's fixed ones.
+/// Stuff bits that are counted in addition to the fixed stuff bits of FD frames.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Stuffing {
-    /// None: the minimum length.
+    /// No stuff bits, which gives the minimum length.
     None,
-    /// One after every four bits: the maximum length.
+    /// One stuff bit after every four bits, which gives the maximum length.
     Worst,
 }
 
 /// Number of bits at each bit rate.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Bits {
-    /// At the nominal rate, used for arbitration and classic frames.
+    /// Number of bits at the nominal rate, which is used for arbitration and classic frames.
     pub nominal: u32,
-    /// At the data rate; 0 unless the frame switches the rate.
+    /// Number of bits at the data rate; 0 unless the frame switches the rate.
     pub data: u32,
 }
 
@@ -193,7 +193,7 @@ impl Bits {
     }
 }
 
-/// Fraction of the bus capacity taken by frames with these rates in Hz; above 1 if the bus is overloaded.
+/// Fraction of the bus capacity that frames with these rates in Hz use; above 1 if the bus is overloaded.
 pub fn load_frac(traffic: impl IntoIterator<Item = (Bits, f64)>, rates: BitRates) -> f64 {
     traffic.into_iter().map(|(bits, rate_hz)| bits.seconds(rates) * rate_hz).sum()
 }

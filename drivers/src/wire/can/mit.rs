@@ -8,7 +8,7 @@
 use super::CanError;
 use super::scale::Scale;
 
-/// Ranges of a motor's raw values. Gains range from 0 to these limits, everything else from the negative to the
+/// Ranges of a motor's raw values. Gains range from 0 to these limits, and the other values from the negative to the
 /// positive limit.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Limits {
@@ -30,7 +30,7 @@ impl Limits {
         Self { position_rad, velocity_rad_s, torque_nm, kp_nm_rad: 500.0, kd_nm_s_rad: 5.0 }
     }
 
-    /// The command as it is sent, with every number clamped to its limits; NaN stays NaN.
+    /// Returns the command as it is sent, with every number clamped to its limits. NaN stays NaN.
     pub fn clamped(&self, command: &Command) -> Command {
         let clamp_symmetric = |value: f64, max: f64| value.clamp(-max, max);
         Command {
@@ -70,12 +70,12 @@ pub struct Motion {
 }
 
 /// Conversion of the numbers of a command to raw values.
-pub(super) struct Scales {
-    pub(super) position: Scale,
-    pub(super) velocity: Scale,
-    pub(super) kp: Scale,
-    pub(super) kd: Scale,
-    pub(super) torque: Scale,
+pub(crate) struct Scales {
+    pub(crate) position: Scale,
+    pub(crate) velocity: Scale,
+    pub(crate) kp: Scale,
+    pub(crate) kd: Scale,
+    pub(crate) torque: Scale,
 }
 
 impl Scales {
@@ -85,7 +85,7 @@ impl Scales {
     }
 
     /// Scales with 16 bits for the position and `n_bits` for everything else.
-    pub(super) fn with_bits(limits: &Limits, n_bits: u32) -> Self {
+    pub(crate) fn with_bits(limits: &Limits, n_bits: u32) -> Self {
         Self {
             position: Scale::symmetric(limits.position_rad, 16),
             velocity: Scale::symmetric(limits.velocity_rad_s, n_bits),
@@ -124,7 +124,7 @@ pub fn decode(bytes: &[u8; 8], limits: &Limits) -> Command {
     }
 }
 
-/// Encodes the five bytes of a motion that follow the motor's number in the feedback of all manufacturers.
+/// Encodes the five bytes of a motion, which follow the motor's ID in the feedback of all manufacturers.
 pub fn encode_motion(motion: &Motion, limits: &Limits) -> Result<[u8; 5], CanError> {
     let scales = Scales::of(limits);
     let [p1, p0] = scales.position.raw_from_value("the position", motion.position_rad)?.to_be_bytes();
@@ -209,7 +209,7 @@ mod tests {
                 torque_nm: random_within(10.0),
             };
             let back = decode(&encode(&command, &LIMITS).expect("numbers"), &LIMITS);
-            // Half a step of the range.
+            // Tolerance: half a quantization step.
             for (name, error, range, counts) in [
                 ("position", back.position_rad - command.position_rad, 25.0, 65_535.0),
                 ("velocity", back.velocity_rad_s - command.velocity_rad_s, 60.0, 4095.0),

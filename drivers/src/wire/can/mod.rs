@@ -1,22 +1,18 @@
-//! Motors on a CAN bus: frames as plain data, and the protocols of several motor families.
+//! CAN frames as plain data, and the encodings that several motor families share. The codec of a family is in its
+//! folder of [`can`](crate::can).
 //!
 //! Every codec is pure: it converts between a [`Frame`] and SI values. Values outside the range of a field are
 //! clamped where the manufacturers' own examples clamp (MIT packing, Robstride, ODrive's feedforward), and are errors
 //! everywhere else. NaN is always an error.
 
 pub mod canopen;
-pub mod cia402;
-pub mod damiao;
 pub mod frame;
 pub mod mit;
-pub mod odrive;
-pub mod robstride;
 pub mod scale;
-pub mod tmotor;
 
 pub use frame::{Frame, Id};
 
-/// An invalid frame, or one that does not follow its protocol.
+/// A frame is invalid, or does not follow its protocol.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum CanError {
@@ -36,7 +32,7 @@ pub enum CanError {
         /// Requested length in bytes.
         got_bytes: usize,
     },
-    /// A frame that is not a message of the expected kind, according to its identifier or format.
+    /// According to its ID or format, a frame is not a message of the expected kind.
     #[error("expected {message}, found a frame with identifier {id:#x}")]
     UnexpectedFrame {
         /// Expected message.
@@ -44,10 +40,10 @@ pub enum CanError {
         /// Identifier of the frame.
         id: u32,
     },
-    /// A message of the wrong length.
+    /// A message has the wrong length.
     #[error("{message}: {got_bytes} bytes, expected {expected_bytes}")]
     Length {
-        /// Which message.
+        /// Name of the message.
         message: &'static str,
         /// Actual length in bytes.
         got_bytes: usize,
@@ -62,13 +58,13 @@ pub enum CanError {
         /// Its value.
         raw: u32,
     },
-    /// NaN, or infinity in a field that does not allow it.
+    /// A field contains NaN, or infinity where it is not allowed.
     #[error("{field} is not a finite number")]
     NotFinite {
         /// Which field.
         field: &'static str,
     },
-    /// A number outside the range of its field.
+    /// A number is outside the range of its field.
     #[error("{field} is {value}, must be {lower} to {upper}")]
     Range {
         /// Which field.
@@ -109,12 +105,17 @@ pub enum CanError {
 }
 
 /// Finds the variant in `all` whose number is `raw`.
-fn decode_enum<T: Copy>(field: &'static str, raw: u32, all: &[T], number: impl Fn(T) -> u32) -> Result<T, CanError> {
+pub(crate) fn decode_enum<T: Copy>(
+    field: &'static str,
+    raw: u32,
+    all: &[T],
+    number: impl Fn(T) -> u32,
+) -> Result<T, CanError> {
     all.iter().copied().find(|known| number(*known) == raw).ok_or(CanError::Undefined { field, raw })
 }
 
 /// Returns the eight bytes of a data frame with an 11-bit or 29-bit identifier; any other frame is an error.
-fn eight_bytes(frame: &Frame, message: &'static str, extended: bool) -> Result<[u8; 8], CanError> {
+pub(crate) fn eight_bytes(frame: &Frame, message: &'static str, extended: bool) -> Result<[u8; 8], CanError> {
     let id = frame.id();
     if frame.is_remote() || id.is_extended() != extended {
         return Err(CanError::UnexpectedFrame { message, id: id.value() });
@@ -124,12 +125,12 @@ fn eight_bytes(frame: &Frame, message: &'static str, extended: bool) -> Result<[
 }
 
 #[cfg(test)]
-mod testing {
+pub(crate) mod testing {
     use super::{Frame, Id};
     use kinematics::random::Random;
 
     /// Frames of random format, identifier, length and bytes; every fourth has the identifier `id`.
-    pub(super) fn random_frames(seed: u64, id: Id) -> impl Iterator<Item = Frame> {
+    pub(crate) fn random_frames(seed: u64, id: Id) -> impl Iterator<Item = Frame> {
         let mut random = Random::new(seed);
         (0..20_000).map(move |round| {
             let identifier = match random.below(2) {
@@ -150,7 +151,7 @@ mod testing {
     }
 
     /// The frame truncated to every shorter length, and twice as long as an FD frame. All of these must be rejected.
-    pub(super) fn truncated_and_doubled(frame: &Frame) -> Vec<Frame> {
+    pub(crate) fn truncated_and_doubled(frame: &Frame) -> Vec<Frame> {
         let bytes = [frame.data(), frame.data()].concat();
         let n_bytes = frame.data().len();
         let cut = (0..n_bytes).map(|len| Frame::classic(frame.id(), &bytes[..len]));

@@ -1,17 +1,17 @@
 //! Linear map between SI values and unsigned integers, shared by MIT packing and Robstride.
 //!
-//! Source: `float_to_uint` and `uint_to_float` of Ben Katz's mini cheetah firmware, as in `cmjang/DM_Control_Python`:
-//! 0 is the lower end of the range, the maximum integer the upper end. Their examples truncate. We round to the
-//! nearest integer, and halves down, so that 0 in a symmetric range has the same bytes as theirs.
+//! Source: `float_to_uint` and `uint_to_float` of Ben Katz's mini cheetah firmware, as in `cmjang/DM_Control_Python`: 0
+//! is the lower end of the range, the maximum integer the upper end. These sources truncate. We round to the nearest
+//! integer, and halves down, so that 0 in a symmetric range is encoded as in these sources.
 
 use super::CanError;
 
 /// Range of a field, and the number of bits that encode it.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Scale {
-    /// Value of raw 0.
+    /// Value that is encoded as 0.
     pub lower: f64,
-    /// Value of the maximum raw integer.
+    /// Value that is encoded as the maximum integer.
     pub upper: f64,
     /// Number of bits, at most 16.
     pub n_bits: u32,
@@ -28,7 +28,7 @@ impl Scale {
         Self { lower: 0.0, upper: max, n_bits }
     }
 
-    /// Value of one raw unit.
+    /// Difference of the values of two successive raw integers.
     pub fn step(&self) -> f64 {
         (self.upper - self.lower) / self.max_raw()
     }

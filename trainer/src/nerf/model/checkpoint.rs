@@ -212,7 +212,7 @@ impl NerfModel {
         keyframes: &[Arc<Keyframe>],
     ) -> Result<(Self, Vec<Arc<Keyframe>>), Error> {
         let (mut model, state) = Self::of_state(gpu, checkpoint, FieldTrainer::training_buffers)?;
-        let (images, rest) = keyframe_signature::match_keyframes(&state.images, keyframes, Arc::clone)?;
+        let (images, rest) = keyframe_signature::match_keyframes(&state.images, keyframes)?;
         model.images = images.into_iter().map(RayImage::new).collect();
         model.is_extent_stale = state.is_extent_stale;
         model.n_hinted = state.n_hinted.min(model.images.len());

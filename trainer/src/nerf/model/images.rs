@@ -13,9 +13,10 @@ use crate::nerf::extent::Extent;
 use crate::nerf::field_trainer::RayColor;
 use crate::nerf::params::{EMBEDDING, IMAGE_PARAM_STRIDE};
 use crate::nerf::rays::{self, RayImage, RaySampling};
-use calibration::TrialReport;
-use calibration::{CameraCorrection, CameraRefinement, EMBEDDING_DIM, ParamSet, drift_weight, interpolate};
-use calibration::{Gain, MIN_GAIN_DB};
+use calibration::{
+    CameraCorrection, CameraRefinement, Candidate, EMBEDDING_DIM, MIN_VALIDATION_IMAGES, ParamSet, Trial, TrialReport,
+    drift_weight, interpolate,
+};
 use keyframe::Keyframe;
 use kinematics::{Stamp, Transform};
 use nalgebra::{Translation3, UnitQuaternion, Vector3};
@@ -27,8 +28,6 @@ use std::sync::Arc;
 const POSE_START_DIVISOR: u64 = 32;
 const TRIAL_START_DIVISOR: u64 = 8;
 const TRIAL_LENGTH_DIVISOR: u64 = 16;
-/// Minimum number of validation images for a trial.
-const MIN_VALIDATION_IMAGES: usize = 4;
 /// Batches of rays for a comparison: some hundred rays per image.
 const VALIDATION_BATCHES: u64 = 8;
 /// Seed for choosing the rays of a comparison.
@@ -47,50 +46,29 @@ pub(super) struct FieldSnapshot {
 /// Trials of image parameters.
 #[derive(Debug, Default)]
 pub(super) struct Trials {
-    /// Candidates in the order of their trials; the first is on trial unless the phase is `Waiting`.
+    /// Candidates in the order of their trials; the first is the one on trial.
     remaining: VecDeque<ParamSet>,
     pub(super) finished: Vec<TrialReport>,
-    trial_phase: TrialPhase,
+    running: Option<RunningTrial>,
 }
 
-#[derive(Debug, Default)]
-enum TrialPhase {
-    /// The next trial starts at its step.
-    #[default]
-    Waiting,
-    Variant {
-        before: FieldSnapshot,
-    },
-    Baseline {
-        before: FieldSnapshot,
-        variant: FieldSnapshot,
-        /// Mean squared error of each validation image with the variant.
-        variant_errors: Vec<f64>,
-    },
+/// A trial in progress. Its first half trains the variant, its second half the baseline.
+#[derive(Debug)]
+struct RunningTrial {
+    before: FieldSnapshot,
+    /// At the end of the first half: the field, and the mean squared error of each validation image.
+    variant: Option<(FieldSnapshot, Vec<f64>)>,
 }
 
 /// The subset of calibration parameters that a field can optimize.
-fn image_params_of_set(set: ParamSet) -> ParamSet {
+pub(super) fn image_params_of_set(set: ParamSet) -> ParamSet {
     set & (ParamSet::IMAGE_POSES | ParamSet::IMAGE_GAINS)
-}
-
-/// Parameters that are always optimized, without a trial.
-pub(super) fn given(choice: &CameraRefinement) -> ParamSet {
-    match choice {
-        CameraRefinement::Always(set) => image_params_of_set(*set),
-        CameraRefinement::Try(_) => ParamSet::empty(),
-    }
 }
 
 impl Trials {
     pub(super) fn of(choice: &CameraRefinement) -> Self {
-        let remaining = match choice {
-            CameraRefinement::Try(candidates) => {
-                candidates.iter().map(|set| image_params_of_set(*set)).filter(|set| !set.is_empty()).collect()
-            }
-            CameraRefinement::Always(_) => VecDeque::new(),
-        };
-        Self { remaining, finished: Vec::new(), trial_phase: TrialPhase::Waiting }
+        let remaining = choice.candidates().iter().map(|set| image_params_of_set(*set)).filter(|set| !set.is_empty());
+        Self { remaining: remaining.collect(), ..Self::default() }
     }
 
     /// The trials that remain after some have finished.
@@ -107,10 +85,7 @@ impl Trials {
 
     /// During a trial, the field from before it.
     pub(super) fn before(&self) -> Option<&FieldSnapshot> {
-        match &self.trial_phase {
-            TrialPhase::Waiting => None,
-            TrialPhase::Variant { before } | TrialPhase::Baseline { before, .. } => Some(before),
-        }
+        self.running.as_ref().map(|trial| &trial.before)
     }
 }
 
@@ -127,11 +102,9 @@ impl NerfModel {
     /// The step at which a trial starts or changes its phase.
     fn next_trial_step(&self) -> Option<u64> {
         let share = |of: u64| (self.options.common.n_planned_steps / of).max(1);
-        let at = match &self.trials.trial_phase {
-            TrialPhase::Waiting => share(TRIAL_START_DIVISOR),
-            TrialPhase::Variant { before } | TrialPhase::Baseline { before, .. } => {
-                before.step + share(TRIAL_LENGTH_DIVISOR)
-            }
+        let at = match self.trials.before() {
+            None => share(TRIAL_START_DIVISOR),
+            Some(before) => before.step + share(TRIAL_LENGTH_DIVISOR),
         };
         (!self.trials.are_finished()).then_some(at)
     }
@@ -152,52 +125,43 @@ impl NerfModel {
 
     fn advance_trial(&mut self) -> Result<(), Error> {
         let Some(candidate) = self.trials.remaining.front().copied() else { return Ok(()) };
-        match std::mem::take(&mut self.trials.trial_phase) {
-            TrialPhase::Waiting if self.validation_images.len() < MIN_VALIDATION_IMAGES => {
+        match self.trials.running.take() {
+            None if self.validation_images.len() < MIN_VALIDATION_IMAGES => {
                 log::info!(
                     "{candidate}: no trial: {} validation images found, at least {MIN_VALIDATION_IMAGES} needed",
                     self.validation_images.len()
                 );
                 self.end_trials();
             }
-            TrialPhase::Waiting => match self.rule_out(candidate)? {
-                Some(report) => self.end_trial(report),
+            None => match self.rule_out(candidate)? {
+                Some(trial) => self.end_trial(&trial),
                 None => {
-                    let before = self.snapshot()?;
+                    self.trials.running = Some(RunningTrial { before: self.snapshot()?, variant: None });
                     self.learned_params |= candidate;
-                    self.trials.trial_phase = TrialPhase::Variant { before };
                 }
             },
-            TrialPhase::Variant { before } => {
+            Some(RunningTrial { before, variant: None }) => {
                 let variant_errors = self.validation_errors()?;
                 let variant = self.snapshot()?;
                 self.n_discarded_steps += self.step - before.step;
                 self.restore(&before)?;
-                self.trials.trial_phase = TrialPhase::Baseline { before, variant, variant_errors };
+                self.trials.running = Some(RunningTrial { before, variant: Some((variant, variant_errors)) });
             }
-            TrialPhase::Baseline { before, variant, variant_errors } => {
-                let baseline_errors = self.validation_errors()?;
-                let report = measure_gain(candidate, &variant_errors, &baseline_errors);
-                if report.kept {
+            Some(RunningTrial { before, variant: Some((variant, variant_errors)) }) => {
+                let trial = measure_gain(candidate, &variant_errors, &self.validation_errors()?);
+                if trial.kept {
                     self.n_discarded_steps += self.step - before.step;
                     self.restore(&variant)?;
                 }
-                self.end_trial(report);
+                self.end_trial(&trial);
             }
         }
         Ok(())
     }
 
-    fn end_trial(&mut self, report: TrialReport) {
-        log::info!(
-            "{}: {:+.2} dB on {} validation images (standard error {:.2}): {}",
-            report.candidate,
-            report.gain_db,
-            report.n_images,
-            report.standard_error_db,
-            if report.kept { "kept" } else { "rejected: no significant gain" },
-        );
-        self.trials.finished.push(report);
+    fn end_trial(&mut self, trial: &Trial) {
+        trial.log_result();
+        self.trials.finished.push(trial.report());
         self.trials.remaining.pop_front();
         if self.trials.are_finished() {
             self.end_trials();
@@ -218,15 +182,15 @@ impl NerfModel {
     /// Ends all trials; validation images become training images.
     fn end_trials(&mut self) {
         self.trials.remaining.clear();
-        self.trials.trial_phase = TrialPhase::Waiting;
+        self.trials.running = None;
         self.images.append(&mut self.validation_images);
         self.is_extent_stale = true;
     }
 
-    /// Estimates the gain of a candidate without training it, and returns a report if there is none. For appearance:
-    /// scales pictures by gains interpolated from training images, and checks whether that brings them closer to the
-    /// validation images.
-    fn rule_out(&mut self, candidate: ParamSet) -> Result<Option<TrialReport>, Error> {
+    /// Estimates the gain of a candidate without training it, and returns the result if the gain is not significant.
+    /// For appearance: scales pictures by gains interpolated from training images, and checks whether that brings them
+    /// closer to the validation images.
+    fn rule_out(&mut self, candidate: ParamSet) -> Result<Option<Trial>, Error> {
         if !candidate.contains(ParamSet::IMAGE_GAINS) {
             return Ok(None);
         }
@@ -248,15 +212,9 @@ impl NerfModel {
             own.error_with_gain(log_gain.exp())
         });
         let baseline = compared.iter().map(|own| own.error_with_gain(1.0));
-        let report = measure_gain(candidate, &variant.collect::<Vec<_>>(), &baseline.collect::<Vec<_>>());
-        log::info!(
-            "{}: no trial: scaling brightness gains {:+.2} dB on {} validation images (standard error {:.2})",
-            report.candidate,
-            report.gain_db,
-            report.n_images,
-            report.standard_error_db
-        );
-        Ok((!report.kept).then_some(report))
+        let trial = measure_gain(candidate, &variant.collect::<Vec<_>>(), &baseline.collect::<Vec<_>>());
+        log::info!("estimated by scaling brightness: {trial}");
+        Ok((!trial.kept).then_some(trial))
     }
 
     /// Mean squared color error of each validation image, with its pose and embedding interpolated from training images
@@ -405,21 +363,14 @@ impl Comparison {
 }
 
 /// Gain of a candidate, from mean squared errors of the same images with it and without it.
-fn measure_gain(candidate: ParamSet, variant: &[f64], baseline: &[f64]) -> TrialReport {
+fn measure_gain(candidate: ParamSet, variant: &[f64], baseline: &[f64]) -> Trial {
     let gains: Vec<f64> = variant
         .iter()
         .zip(baseline)
         .filter(|(variant, baseline)| **variant > 0.0 && **baseline > 0.0)
         .map(|(variant, baseline)| 10.0 * (baseline / variant).log10())
         .collect();
-    let gain = Gain::of(&gains);
-    TrialReport {
-        candidate: candidate.to_string(),
-        gain_db: gain.mean_db,
-        standard_error_db: gain.standard_error_db,
-        n_images: gain.n_images,
-        kept: gain.n_images >= MIN_VALIDATION_IMAGES && gain.is_significant(MIN_GAIN_DB),
-    }
+    Trial::of_gains(Candidate::Cameras(candidate), &gains).with_enough_images()
 }
 
 #[cfg(test)]

@@ -1,7 +1,10 @@
 //! Reduction of the model's size: contribution of each splat, pruning of the least contributing ones, and lower color
 //! degrees.
 
-use super::{PreparedView, SplatTrainer, VIEWS_AT_ONCE};
+use super::SplatTrainer;
+use super::optimizer::StepContext;
+use super::recorder::Recorder;
+use super::view_set::VIEWS_AT_ONCE;
 use crate::Error;
 use crate::splat::buffers::SplatBuffers;
 use crate::splat::kernels::TrainPipelines;
@@ -12,72 +15,79 @@ const MAX_VIEWS: usize = 64;
 
 impl SplatTrainer {
     /// Contribution of each splat to the views: the sum of its blending weights, in pixels.
-    pub(super) fn contributions(&mut self, pipelines: &TrainPipelines) -> Result<Vec<f32>, Error> {
-        let contributions = self.gpu.storage("splat.contributions", 4 * u64::from(self.splats.n_splats))?;
+    pub(super) fn contributions(&mut self, learn: &TrainPipelines) -> Result<Vec<f32>, Error> {
+        let n_splats = self.model.splats.n_splats;
+        let contributions = self.recorder.gpu.storage("splat.contributions", 4 * u64::from(n_splats))?;
         let stride = self.views.len().div_ceil(MAX_VIEWS).max(1);
         let sampled_views: Vec<usize> = (0..self.views.len()).step_by(stride).collect();
         for view_ix in &sampled_views {
-            self.make_space(*view_ix, 0)?;
+            self.reserve_view(self.views.size_px((*view_ix, 0)))?;
         }
-        if let Some(image_buffers) = &self.training_buffers {
+        if let Some(image_buffers) = &self.optimizer.image_buffers {
             // An error of one at every pixel, and a gradient of zero.
-            self.gpu.write(
+            self.recorder.gpu.write(
                 &image_buffers.pixel_totals,
                 0,
                 bytemuck::cast_slice(&[0.0f32, 1.0].repeat(image_buffers.n_pixels as usize)),
             );
-            self.passes.clear(&image_buffers.upstream);
+            self.recorder.passes.clear(&image_buffers.upstream);
         }
+        self.optimizer.set_n_splats(&self.recorder.gpu, n_splats);
         for (ix, view_ix) in sampled_views.iter().copied().enumerate() {
             if ix % VIEWS_AT_ONCE == 0 {
-                let next = sampled_views[ix..].iter().take(VIEWS_AT_ONCE);
-                self.make_levels(&next.map(|view_ix| (*view_ix, 0)).collect())?;
+                let next = sampled_views[ix..].iter().take(VIEWS_AT_ONCE).map(|view_ix| (*view_ix, 0)).collect();
+                self.views.upload(&mut self.recorder, &next, self.schedule.step)?;
             }
             loop {
-                let mut list = std::mem::take(&mut self.passes);
-                let PreparedView { view, .. } = self.prepared_view(&mut list, pipelines, (view_ix, 0))?;
-                view.draw(&mut list, &self.draw);
-                view.backward(&mut list, pipelines);
-                view.contribute(&mut list, pipelines, &contributions); // Adds nothing if a buffer was too small.
-                list.submit(&self.gpu);
-                self.passes = list;
-                let counters: Vec<u32> = self.gpu.read(&self.train_status, status::LEN)?;
-                if !self.grow_scratch(&counters)? {
+                let Self { recorder: Recorder { gpu, passes }, model, renderer, optimizer, views, .. } = &mut *self;
+                let context = StepContext { gpu, learn, renderer, model };
+                let view = optimizer.prepared_view(&context, passes, views.ready_level((view_ix, 0))?)?.view;
+                view.draw(passes, &renderer.pipelines);
+                view.backward(passes, learn);
+                view.contribute(passes, learn, &contributions); // Adds nothing if a buffer was too small.
+                passes.submit(gpu);
+                let counters: Vec<u32> = gpu.read(&optimizer.status, status::LEN)?;
+                if !self.renderer.grow_scratch(&mut self.recorder, &counters)? {
                     break;
                 }
-                self.gpu.write(&self.train_status, 4 * status::FAILED as u64, &[0; 12]);
+                self.optimizer.clear_failure(&self.recorder.gpu);
             }
         }
-        self.passes.clear_bindings();
-        self.gpu.read(&contributions, self.splats.n_splats as usize)
+        self.recorder.passes.clear_bindings();
+        self.recorder.gpu.read(&contributions, n_splats as usize)
     }
 
     /// Keeps the `n_kept` splats that contribute most, without changing their order.
     pub(super) fn keep_most_contributing(&mut self, n_kept: u32) -> Result<(), Error> {
-        let pipelines = self.train_pipelines()?;
-        let contributions = self.contributions(&pipelines)?;
-        let mut by_contribution: Vec<u32> = (0..self.splats.n_splats).collect();
+        let learn = self.learn()?;
+        let contributions = self.contributions(&learn)?;
+        let mut by_contribution: Vec<u32> = (0..self.model.splats.n_splats).collect();
         by_contribution
             .sort_by(|a, b| contributions[*b as usize].total_cmp(&contributions[*a as usize]).then(a.cmp(b)));
         by_contribution.truncate(n_kept as usize);
         by_contribution.sort_unstable();
-        self.splats = gather_splats(self, &pipelines, &by_contribution)?;
-        self.passes.clear_bindings();
-        self.write_n_splats();
+        self.model.splats = gather_splats(&mut self.recorder, &self.model.splats, &learn, &by_contribution)?;
+        self.recorder.passes.clear_bindings();
         Ok(())
     }
 
     /// Lowers the degree of the colors.
     pub(super) fn lower_degree(&mut self, sh_degree: u32) -> Result<(), Error> {
-        self.splats = self.splats.resized(&self.gpu, self.splats.capacity, sh_degree)?;
-        self.passes.clear_bindings();
+        let splats = &mut self.model.splats;
+        *splats = splats.resized(&self.recorder.gpu, splats.capacity, sh_degree)?;
+        self.recorder.passes.clear_bindings();
         Ok(())
     }
 }
 
 /// Copies the splats with the given indices, and their moments.
-fn gather_splats(trainer: &mut SplatTrainer, pipelines: &TrainPipelines, kept: &[u32]) -> Result<SplatBuffers, Error> {
-    let (gpu, splats) = (&trainer.gpu, &trainer.splats);
+fn gather_splats(
+    recorder: &mut Recorder,
+    splats: &SplatBuffers,
+    learn: &TrainPipelines,
+    kept: &[u32],
+) -> Result<SplatBuffers, Error> {
+    let Recorder { gpu, passes } = recorder;
     let n_kept = u32::try_from(kept.len()).expect("at most the number of splats, which is a u32");
     let mut fewer = SplatBuffers::new(gpu, n_kept, splats.sh_degree)?;
     let indices = gpu.storage_with("splat.kept", bytemuck::cast_slice(kept))?;
@@ -97,9 +107,9 @@ fn gather_splats(trainer: &mut SplatTrainer, pipelines: &TrainPipelines, kept: &
             ("to_words", to),
         ];
         let n_words = u64::from(n_kept) * u64::from(words) * u64::from(*n_planes);
-        trainer.passes.dispatch(gpu, &pipelines.gather, n_words.div_ceil(256), &buffers);
+        passes.dispatch(gpu, &learn.gather, n_words.div_ceil(256), &buffers);
     }
-    trainer.passes.submit(gpu);
+    passes.submit(gpu);
     fewer.set_active_degree(gpu, splats.active_degree());
     fewer.set_n_splats(gpu, n_kept);
     Ok(fewer)
@@ -116,7 +126,6 @@ mod tests {
     use calibration::Candidate;
     use calibration::Trial;
     use keyframe::{Keyframe, Split};
-    use kinematics::random::Random;
     use std::sync::Arc;
 
     fn trained(count: CountPolicy, keyframes: &[Arc<Keyframe>], gpu: Arc<Gpu>, n_steps: u64) -> SplatTrainer {
@@ -143,12 +152,13 @@ mod tests {
     #[test]
     fn contributions_sum_to_coverage() {
         let (mut trainer, _) = some_trained(60);
-        trainer.views.truncate(1);
-        let pipelines = trainer.train_pipelines().unwrap();
-        let contributions = trainer.contributions(&pipelines).unwrap();
-        let n_pixels = trainer.views[0].keyframe.size_px.iter().product::<u32>() as usize;
-        let image = &trainer.training_buffers.as_ref().unwrap().image;
-        let colors: Vec<[f32; 4]> = trainer.gpu.read(image, n_pixels).unwrap();
+        let only = trainer.views.keyframe(0).clone();
+        trainer.views.retain(|keyframe| Arc::ptr_eq(keyframe, &only));
+        let learn = trainer.learn().unwrap();
+        let contributions = trainer.contributions(&learn).unwrap();
+        let n_pixels = only.size_px.iter().product::<u32>() as usize;
+        let image = &trainer.optimizer.image_buffers.as_ref().unwrap().image;
+        let colors: Vec<[f32; 4]> = trainer.recorder.gpu.read(image, n_pixels).unwrap();
         let covered: f64 = colors.iter().map(|[.., transmittance]| 1.0 - f64::from(*transmittance)).sum();
         let reported: f64 = contributions.iter().map(|sum| f64::from(*sum)).sum();
         assert!(covered > 0.2 * n_pixels as f64 && (reported / covered - 1.0).abs() < 1e-4, "{reported} of {covered}");
@@ -157,13 +167,13 @@ mod tests {
     #[test]
     fn most_contributing_splats_are_kept_unchanged() {
         let (mut trainer, _) = some_trained(120);
-        let pipelines = trainer.train_pipelines().unwrap();
-        let contributions = trainer.contributions(&pipelines).unwrap();
+        let learn = trainer.learn().unwrap();
+        let contributions = trainer.contributions(&learn).unwrap();
         let before = words(&trainer);
-        let n_kept = trainer.splats.n_splats / 3;
+        let n_kept = trainer.model.splats.n_splats / 3;
         trainer.keep_most_contributing(n_kept).unwrap();
         let after = words(&trainer);
-        assert!(trainer.splats.n_splats == n_kept && n_kept > 50, "{n_kept}");
+        assert!(trainer.model.splats.n_splats == n_kept && n_kept > 50, "{n_kept}");
         let mut sorted = contributions.clone();
         sorted.sort_by(|a, b| b.total_cmp(a));
         let min_kept = sorted[n_kept as usize - 1];
@@ -177,10 +187,10 @@ mod tests {
 
     /// The words of each splat, for every plane of every buffer.
     fn words(trainer: &SplatTrainer) -> Vec<Vec<Vec<u32>>> {
-        let splats = &trainer.splats;
+        let splats = &trainer.model.splats;
         let mut all = Vec::new();
         for (buffer, n_planes, bytes) in splats.planes() {
-            let words: Vec<u32> = trainer.gpu.read(buffer, (buffer.bytes() / 4) as usize).unwrap();
+            let words: Vec<u32> = trainer.recorder.gpu.read(buffer, (buffer.bytes() / 4) as usize).unwrap();
             let per_plane = splats.capacity as usize * (bytes / 4) as usize;
             for plane in words.chunks_exact(per_plane.max(1)).take(n_planes as usize) {
                 all.push(
@@ -198,11 +208,12 @@ mod tests {
     /// Adds noise of up to a quarter of the range to the images: no model can score much more than 21 dB on them.
     fn noisy(keyframes: &[Arc<Keyframe>]) -> Vec<Arc<Keyframe>> {
         let noisy = |keyframe: &Arc<Keyframe>| {
-            let mut random = Random::new(keyframe.stamp.0.cast_unsigned());
+            let mut state = keyframe.stamp.0.cast_unsigned();
             let mut rgba = keyframe.rgba_srgb.to_vec();
             for pixel in rgba.chunks_exact_mut(4) {
                 for color in &mut pixel[..3] {
-                    let noise = i16::try_from(random.below(129)).unwrap() - 64;
+                    state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+                    let noise = i16::try_from((state >> 33) % 129).unwrap() - 64;
                     *color = u8::try_from((i16::from(*color) + noise).clamp(0, 255)).unwrap();
                 }
             }
@@ -228,7 +239,7 @@ mod tests {
         );
         let n_learned = keyframes.iter().filter(|keyframe| keyframe.split != Split::Test).count();
         assert!(!tested.trials.holds_validation() && tested.views.len() == n_learned, "{reported:?}");
-        assert!(tested.progress().primitives <= 2000 && tested.splats.sh_degree == 0, "{reported:?}");
+        assert!(tested.progress().primitives <= 2000 && tested.model.splats.sh_degree == 0, "{reported:?}");
         let tests = keyframes.iter().zip(&clean).filter(|(keyframe, _)| keyframe.split == Split::Test);
         let ceilings: Vec<f64> = tests
             .map(|(noisy, clean)| {

@@ -1,95 +1,23 @@
 //! Scores of the model in training on images that it was not trained on.
 
-use super::{CameraCorrections, RequestedParts, SplatTrainer, TrainPipelineState, VIEWS_AT_ONCE, corrected_camera};
+use super::SplatTrainer;
+use super::products::{self, Products};
+use super::renderer::DrawnView;
+use super::view_set::VIEWS_AT_ONCE;
 use crate::Error;
-use crate::gpu::{Buffer, Gpu, Passes, Pipeline};
-use crate::splat::buffers::ImageBuffers;
 use crate::splat::params::Camera;
 use crate::splat::trials::Scores;
 use crate::splat::views::{Level, camera_of};
-use calibration::interpolate;
+use calibration::{CalibratedCamera, CameraCorrection, interpolate};
 use keyframe::Keyframe;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
-/// Sums over the pixels of a picture and an image, for one color.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-struct Products {
-    picture_picture: u64,
-    picture_image: u64,
-    image_image: u64,
-    n_visible: u64,
-}
-
 /// A keyframe and the sums of its comparison with a picture.
 type ScoredKeyframe = (Arc<Keyframe>, [Products; 3]);
 
-/// PSNR in dB of a picture whose colors are multiplied by gains; `None` if all pixels are masked. Values above white
-/// are not clamped.
-fn psnr_with(products: &[Products; 3], gains: [f64; 3]) -> Option<f64> {
-    let n: u64 = products.iter().map(|color| color.n_visible).sum();
-    let square = |(color, gain): (&Products, f64)| {
-        gain * gain * color.picture_picture as f64 - 2.0 * gain * color.picture_image as f64 + color.image_image as f64
-    };
-    let squares: f64 = products.iter().zip(gains).map(square).sum();
-    // A squared error of at least one bounds the score: one level of one color at one pixel.
-    (n > 0).then(|| 10.0 * (255.0f64.powi(2) * n as f64 / squares.max(1.0)).log10())
-}
-
-/// Logarithms of the gains that best match a picture to an image.
-fn log_gains(products: &[Products; 3]) -> [f64; 3] {
-    const MAX_LOG_GAIN: f64 = 1.5; // Two photographic stops: larger gains are not caused by exposure.
-    products.map(|color| match (color.picture_image, color.picture_picture) {
-        (0, _) | (_, 0) => 0.0,
-        (with_image, picture_only) => (with_image as f64 / picture_only as f64).ln().clamp(-MAX_LOG_GAIN, MAX_LOG_GAIN),
-    })
-}
-
-/// Size of a workgroup's sums in `score.wgsl`, bytes.
-pub(super) const PRODUCTS_BYTES: usize = 48;
-
-/// Records the comparison of a picture with an image; returns the number of workgroups that write sums.
-pub(super) fn compare(
-    gpu: &Gpu,
-    passes: &mut Passes,
-    score: &Pipeline,
-    (view, image_buffers): (&Buffer, &ImageBuffers),
-    size_px: [u32; 2],
-    image: &Buffer,
-) -> u32 {
-    let n_groups = (size_px[0] * size_px[1]).div_ceil(256);
-    let buffers = [
-        ("view", view),
-        ("pixels", &image_buffers.pixels),
-        ("target_image", image),
-        ("products", &image_buffers.products),
-    ];
-    passes.dispatch(gpu, score, n_groups.into(), &buffers);
-    n_groups
-}
-
-/// The sums over all workgroups.
-fn sum_up(sums: &[[u32; 4]]) -> [Products; 3] {
-    let sum = |color: usize, part: usize| sums.iter().skip(color).step_by(3).map(|of| u64::from(of[part])).sum();
-    [0, 1, 2].map(|color| Products {
-        picture_picture: sum(color, 0),
-        picture_image: sum(color, 1),
-        image_image: sum(color, 2),
-        n_visible: sum(color, 3),
-    })
-}
-
-/// PSNR in dB, bit-identical to [`crate::eval::psnr`] because integer sums are exact.
-fn psnr_as_evaluated(products: &[Products; 3]) -> Result<f64, Error> {
-    let n: u64 = products.iter().map(|color| color.n_visible).sum();
-    if n == 0 {
-        return Err(Error::AllPixelsMasked);
-    }
-    let squares: u64 =
-        products.iter().map(|color| color.picture_picture + color.image_image - 2 * color.picture_image).sum();
-    let mean_square = squares as f64 / n as f64;
-    Ok(10.0 * (255.0_f64.powi(2) / mean_square).log10())
-}
+/// Camera corrections by name.
+type CameraCorrections = BTreeMap<String, CameraCorrection>;
 
 impl SplatTrainer {
     /// PSNR of the displayed picture of a view against a keyframe's image of the same size; `None` before training
@@ -100,33 +28,20 @@ impl SplatTrainer {
         background_srgb: [f32; 3],
         keyframe: &Keyframe,
     ) -> Result<Option<f64>, Error> {
-        let TrainPipelineState::Ready(pipelines) = &self.train else { return Ok(None) };
-        let pipelines = pipelines.clone();
+        let Some(learn) = self.optimizer.pipelines.ready() else { return Ok(None) };
         let rgba = keyframe.rgba_srgb.as_ref();
         if rgba.len() != 4 * camera.size_px[0] as usize * camera.size_px[1] as usize {
             return Ok(None);
         }
-        let image = match self.compared.take() {
-            Some(image) if image.bytes() >= rgba.len() as u64 => {
-                self.gpu.write(&image, 0, rgba);
-                image
-            }
-            _ => {
-                self.passes.clear_bindings();
-                self.gpu.storage_with("splat.compared", rgba)?
-            }
-        };
-        let requested = RequestedParts::Comparison { score: &pipelines.score, image: &image };
-        let take = |parts: &[&[u8]]| sum_up(&bytemuck::pod_collect_to_vec::<u8, [u32; 4]>(parts[0]));
-        let products = self.draw_reading(camera, background_srgb, true, requested, take)?;
-        self.compared = Some(image);
-        psnr_as_evaluated(&products).map(Some)
+        let drawn = DrawnView { splats: self.trials.displayed(&self.model.splats), camera, background_srgb };
+        let products = self.renderer.compare_with_upload(&mut self.recorder, drawn, &learn.score, rgba)?;
+        products::psnr(&products).map(Some)
     }
 
     /// PSNR of the validation keyframes, dB; of at most a limited number, spread evenly over them.
     pub(super) fn score_validation(&mut self) -> Result<Scores, Error> {
         let score = |(keyframe, products): &ScoredKeyframe| {
-            Some(((keyframe.camera.clone(), keyframe.stamp), psnr_with(products, [1.0; 3])?))
+            Some(((keyframe.camera.clone(), keyframe.stamp), products::psnr_with_gains(products, [1.0; 3])?))
         };
         Ok(self.compare_validation()?.iter().filter_map(score).collect())
     }
@@ -146,21 +61,22 @@ impl SplatTrainer {
         for ((keyframe, products), neighbors) in validation.iter().zip(&neighbors) {
             let own = |view_ix: &usize| {
                 let gains = known.get(view_ix)?;
-                let stamp = self.views[*view_ix].keyframe.stamp.0;
+                let stamp = self.views.keyframe(*view_ix).stamp.0;
                 Some((stamp, [0, 1, 2].map(|color| gains[color] - mean[color])))
             };
             let neighbor_gains: BTreeMap<i64, [f64; 3]> = neighbors.iter().filter_map(own).collect();
             let gains = interpolate(&neighbor_gains, keyframe.stamp).unwrap_or_default().map(f64::exp);
-            baseline_db.extend(psnr_with(products, [1.0; 3]));
-            variant_db.extend(psnr_with(products, gains));
+            baseline_db.extend(products::psnr_with_gains(products, [1.0; 3]));
+            variant_db.extend(products::psnr_with_gains(products, gains));
         }
         if let Some(gains) = self.trials.decide_gains(&baseline_db, &variant_db) {
-            self.cameras.enable(gains);
+            self.model.cameras.enable(gains);
             self.prepare_training()?;
             self.add_gains(&mut known, (0..self.views.len()).collect(), &corrections)?;
             for (view_ix, gains) in &known {
-                let keyframe = &self.views[*view_ix].keyframe;
-                self.cameras.initialize_gains(&self.gpu, keyframe, [0, 1, 2].map(|color| gains[color] - mean[color]));
+                let log_gains = [0, 1, 2].map(|color| gains[color] - mean[color]);
+                let keyframe = self.views.keyframe(*view_ix);
+                self.model.cameras.initialize_gains(&self.recorder.gpu, keyframe, log_gains);
             }
         }
         Ok(())
@@ -168,11 +84,11 @@ impl SplatTrainer {
 
     /// The views of the same camera before and after a keyframe.
     fn neighbors(&self, keyframe: &Keyframe) -> Vec<usize> {
-        let of_camera = || self.views.iter().enumerate().filter(|(_, view)| view.keyframe.camera == keyframe.camera);
-        let before = of_camera().filter(|(_, view)| view.keyframe.stamp <= keyframe.stamp);
-        let after = of_camera().filter(|(_, view)| view.keyframe.stamp > keyframe.stamp);
-        let before = before.max_by_key(|(_, view)| view.keyframe.stamp);
-        let after = after.min_by_key(|(_, view)| view.keyframe.stamp);
+        let of_camera = || self.views.keyframes().enumerate().filter(|(_, other)| other.camera == keyframe.camera);
+        let before = of_camera().filter(|(_, other)| other.stamp <= keyframe.stamp);
+        let after = of_camera().filter(|(_, other)| other.stamp > keyframe.stamp);
+        let before = before.max_by_key(|(_, other)| other.stamp);
+        let after = after.min_by_key(|(_, other)| other.stamp);
         before.into_iter().chain(after).map(|(ix, _)| ix).collect()
     }
 
@@ -185,7 +101,8 @@ impl SplatTrainer {
     ) -> Result<(), Error> {
         let unknown: Vec<usize> = view_ixs.into_iter().filter(|view_ix| !known.contains_key(view_ix)).collect();
         for chunk in unknown.chunks(VIEWS_AT_ONCE) {
-            self.make_levels(&chunk.iter().map(|view_ix| (*view_ix, 0)).collect())?;
+            let places = chunk.iter().map(|view_ix| (*view_ix, 0)).collect();
+            self.views.upload(&mut self.recorder, &places, self.schedule.step)?;
             for view_ix in chunk {
                 known.insert(*view_ix, self.gains_of(*view_ix, corrections)?);
             }
@@ -195,76 +112,49 @@ impl SplatTrainer {
 
     /// The gains that best match the picture of a view to its image, which is on the GPU.
     fn gains_of(&mut self, view_ix: usize, corrections: &CameraCorrections) -> Result<[f64; 3], Error> {
-        let keyframe = self.views[view_ix].keyframe.clone();
-        self.draw_keyframe(&keyframe, corrections)?;
-        let (_, Level { image, .. }) = self.views[view_ix].ready_level(0)?;
-        let rendered_view = RenderedView::of(&self.gpu, &self.train, &self.drawing_buffers, &self.draw_view)?;
-        Ok(log_gains(&rendered_view.compare(&mut self.passes, &keyframe, image)?))
+        let learn = self.learn()?;
+        let camera = corrected_camera(corrections, self.views.keyframe(view_ix));
+        let (_, Level { image, .. }) = self.views.ready_level((view_ix, 0))?;
+        let drawn = DrawnView { splats: &self.model.splats, camera: &camera, background_srgb: [0.0; 3] };
+        let products = self.renderer.compare(&mut self.recorder, drawn, &learn.score, image)?;
+        Ok(products::log_gains(&products))
     }
 
     fn compare_validation(&mut self) -> Result<Vec<ScoredKeyframe>, Error> {
-        let corrections = self.learned_corrections()?;
+        let (learn, corrections) = (self.learn()?, self.learned_corrections()?);
         let mut compared = Vec::new();
         for id in self.trials.scored() {
             let Some(validation) = self.trials.validation(&id) else { continue }; // Removed in the meantime.
-            let (keyframe, image) = (validation.keyframe.clone(), validation.image.take());
-            self.draw_keyframe(&keyframe, &corrections)?;
-            let image = match image {
-                Some(image) => image,
-                None => self.gpu.storage_with("splat.validation", &keyframe.rgba_srgb)?,
-            };
-            let rendered_view = RenderedView::of(&self.gpu, &self.train, &self.drawing_buffers, &self.draw_view)?;
-            let products = rendered_view.compare(&mut self.passes, &keyframe, &image)?;
-            if let Some(validation) = self.trials.validation(&id) {
-                validation.image = Some(image);
-            }
-            compared.push((keyframe, products));
+            let camera = corrected_camera(&corrections, &validation.keyframe);
+            let image = validation.uploaded(&self.recorder.gpu)?;
+            let drawn = DrawnView { splats: &self.model.splats, camera: &camera, background_srgb: [0.0; 3] };
+            let products = self.renderer.compare(&mut self.recorder, drawn, &learn.score, image)?;
+            compared.push((validation.keyframe.clone(), products));
         }
         Ok(compared)
     }
 
-    /// Draws the model in training from the camera of a keyframe.
-    fn draw_keyframe(&mut self, keyframe: &Keyframe, corrections: &CameraCorrections) -> Result<(), Error> {
-        let lens = corrected_camera(corrections, keyframe);
-        let camera = Camera {
-            world_from_camera: lens.world_from_camera,
-            focal_px: lens.focal_px,
-            principal_px: lens.principal_px,
-            ..camera_of(keyframe)
-        };
-        self.draw_into_buffers(&camera, [0.0; 3], false)
-    }
-}
-
-/// The picture drawn last.
-struct RenderedView<'a> {
-    gpu: &'a Gpu,
-    score: &'a Pipeline,
-    view: &'a Buffer,
-    image_buffers: &'a ImageBuffers,
-}
-
-impl<'a> RenderedView<'a> {
-    fn of(
-        gpu: &'a Gpu,
-        train: &'a TrainPipelineState,
-        image_buffers: &'a Option<ImageBuffers>,
-        view: &'a Buffer,
-    ) -> Result<Self, Error> {
-        match (train, image_buffers) {
-            (TrainPipelineState::Ready(pipelines), Some(image_buffers)) => {
-                Ok(Self { gpu, score: &pipelines.score, view, image_buffers })
-            }
-            _ => Err(Error::DeviceLost),
+    /// Current corrections of each camera, including a running trial's, for keyframes that alignment has already
+    /// corrected.
+    fn learned_corrections(&self) -> Result<CameraCorrections, Error> {
+        let cameras = &self.model.cameras;
+        if cameras.set.is_empty() {
+            return Ok(CameraCorrections::new());
         }
+        cameras.corrections(&self.recorder.gpu, cameras.set, &cameras.params, self.seeding.scene.size_m)
     }
+}
 
-    /// Sums of the comparison with a keyframe's image.
-    fn compare(&self, passes: &mut Passes, keyframe: &Keyframe, image: &Buffer) -> Result<[Products; 3], Error> {
-        let n_groups = compare(self.gpu, passes, self.score, (self.view, self.image_buffers), keyframe.size_px, image);
-        let read =
-            passes.submit_reading(self.gpu, &[(&self.image_buffers.products, PRODUCTS_BYTES * n_groups as usize)]);
-        Ok(sum_up(&read.finish(self.gpu)?))
+/// The camera of a keyframe with its corrections, for drawing.
+fn corrected_camera(corrections: &CameraCorrections, keyframe: &Keyframe) -> Camera {
+    let lens = corrections
+        .get(keyframe.camera.as_ref())
+        .map_or_else(|| CalibratedCamera::of(keyframe), |correction| correction.apply(keyframe));
+    Camera {
+        world_from_camera: lens.world_from_camera,
+        focal_px: lens.focal_px,
+        principal_px: lens.principal_px,
+        ..camera_of(keyframe)
     }
 }
 
@@ -273,7 +163,7 @@ mod tests {
     use super::*;
     use crate::Method;
     use crate::eval::{PixelPair, psnr};
-    use crate::gpu::GpuOptions;
+    use crate::gpu::{Gpu, GpuOptions};
     use crate::splat::training_tests::{n_keyframes, options, request, train};
     use calibration::{CameraRefinement, ParamSet};
     use keyframe::Split;
@@ -337,7 +227,8 @@ mod tests {
         assert!(matches!(trainer.psnr(&request_for(&same), &fully_masked), Err(Error::AllPixelsMasked)));
         let small = crate::RenderRequest { size_px: [8, 8], ..request_for(&same) };
         assert_eq!(trainer.psnr(&small, &same).unwrap(), None, "another size");
-        let mut loaded = SplatTrainer::from_arrays(trainer.gpu.clone(), options(), &trainer.arrays().unwrap()).unwrap();
+        let mut loaded =
+            SplatTrainer::from_arrays(trainer.recorder.gpu.clone(), options(), &trainer.arrays().unwrap()).unwrap();
         assert_eq!(loaded.psnr(&request_for(&same), &same).unwrap(), None, "the training pipelines are not compiled");
     }
 

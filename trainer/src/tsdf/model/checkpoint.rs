@@ -1,11 +1,11 @@
 //! Checkpoints of a field: everything needed to continue bit for bit.
 
 use super::super::block::{Block, Blocks, GridCoord, N_VOXELS};
-use super::super::buffers::FieldBuffers;
-use super::super::capacity::Capacity;
 use super::super::chosen_grid::VoxelGrid;
 use super::super::options::TsdfOptions;
-use super::{INITIAL_CAPACITY, TsdfModel};
+use super::TsdfModel;
+use super::field_store::FieldStore;
+use super::keyframe_queue::KeyframeQueue;
 use crate::Error;
 use crate::checkpoint::{Array, Checkpoint, PendingCheckpoint};
 use crate::gpu::Gpu;
@@ -30,6 +30,7 @@ pub(super) struct TsdfState {
     pub(super) n_skipped: u64,
     pub(super) n_blocks: u64,
     pub(super) fused: Vec<KeyframeSignature>,
+    pub(super) n_removed: u64,
     /// Pushed but not fused yet, in order.
     pub(super) pending: Vec<KeyframeSignature>,
 }
@@ -45,12 +46,13 @@ impl TsdfModel {
         let blocks = self.blocks()?;
         let state = TsdfState {
             options: self.options.clone(),
-            voxel_grid: self.voxel_grid.clone(),
-            step: self.step,
-            n_skipped: self.n_skipped,
+            voxel_grid: self.voxel_grid().cloned(),
+            step: self.queue.step(),
+            n_skipped: self.queue.n_skipped,
             n_blocks: blocks.len() as u64,
-            fused: self.fused.clone(),
-            pending: self.pending.iter().map(|keyframe| KeyframeSignature::of(keyframe)).collect(),
+            fused: self.queue.fused.clone(),
+            n_removed: self.queue.n_removed,
+            pending: self.queue.pending.iter().map(|keyframe| KeyframeSignature::of(keyframe)).collect(),
         };
         let state = serde_json::to_value(state).map_err(|error| invalid_state(error.to_string()))?;
         Ok((state, arrays_of(&blocks)))
@@ -64,10 +66,11 @@ impl TsdfModel {
         keyframes: &[Arc<Keyframe>],
     ) -> Result<(Self, Vec<Arc<Keyframe>>), Error> {
         let mut model = Self::of_state(gpu, checkpoint)?;
-        let keyframe_signature: Vec<KeyframeSignature> = model.fused.iter().chain(&model.unmatched).cloned().collect();
-        let (mut found, rest) = keyframe_signature::match_keyframes(&keyframe_signature, keyframes, Arc::clone)?;
-        model.pending = found.split_off(model.fused.len()).into();
-        model.unmatched.clear();
+        let KeyframeQueue { pending, fused, unmatched, .. } = &mut model.queue;
+        let known: Vec<KeyframeSignature> = fused.iter().chain(&*unmatched).cloned().collect();
+        let (mut found, rest) = keyframe_signature::match_keyframes(&known, keyframes)?;
+        *pending = found.split_off(fused.len()).into();
+        unmatched.clear();
         Ok((model, rest))
     }
 
@@ -80,23 +83,14 @@ impl TsdfModel {
             serde_json::from_value(checkpoint.state.clone()).map_err(|error| invalid_state(error.to_string()))?;
         let blocks = blocks_of(checkpoint, state.n_blocks)?;
         let mut model = Self::without_budget_check(gpu, state.options)?;
-        let max_resident = model.max_blocks() as usize;
-        model.stale = blocks.keys().copied().collect();
-        let mut resident = blocks;
-        if let Some(last) = resident.keys().nth(max_resident).copied() {
-            model.host_blocks = resident.split_off(&last);
+        if let Some(voxel_grid) = state.voxel_grid {
+            check_lattice(&voxel_grid)?;
+            let max_bytes = model.options.common.max_bytes;
+            model.store = Some(FieldStore::with_blocks(&model.gpu, &model.pipelines, voxel_grid, max_bytes, blocks)?);
         }
-        if let Some(voxel_grid) = &state.voxel_grid {
-            check_lattice(voxel_grid)?;
-            let n_blocks = INITIAL_CAPACITY.n_blocks.min(model.max_blocks());
-            let capacity = Capacity { n_blocks, ..INITIAL_CAPACITY };
-            let field = FieldBuffers::with_blocks(&model.gpu, &model.pipelines, voxel_grid, &resident, capacity)?;
-            model.n_resident = field.n_blocks(&model.gpu)?;
-            model.field = Some(field);
-        }
-        model.voxel_grid = state.voxel_grid;
-        (model.step, model.n_skipped) = (state.step, state.n_skipped);
-        (model.fused, model.unmatched) = (state.fused, state.pending);
+        let (fused, unmatched) = (state.fused, state.pending);
+        let (n_skipped, n_removed) = (state.n_skipped, state.n_removed);
+        model.queue = KeyframeQueue { fused, unmatched, n_skipped, n_removed, ..KeyframeQueue::default() };
         Ok(model)
     }
 }

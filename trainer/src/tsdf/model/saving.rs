@@ -51,12 +51,12 @@ impl TsdfModel {
         Checkpoint::new(METHOD, state, arrays).write(&blocks)?;
         let description = serde_json::json!({
             "method": METHOD,
-            "steps": self.step,
+            "steps": self.queue.step(),
             "blocks": self.progress().primitives,
-            "skipped_keyframes": self.n_skipped,
+            "skipped_keyframes": self.queue.n_skipped,
             "vertices": mesh.positions_m.len(),
             "triangles": mesh.triangles.len(),
-            "voxel_grid": self.voxel_grid,
+            "voxel_grid": self.voxel_grid(),
         });
         let path = folder.join(METADATA_FILE);
         std::fs::write(&path, format!("{description:#}\n")).map_err(|source| write_error(&path, source))

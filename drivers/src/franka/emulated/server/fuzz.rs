@@ -25,14 +25,14 @@ const MAX_STEPS: u16 = 500;
 /// Executes concatenated client actions. Each starts with one byte kind and two bytes length, little-endian.
 ///
 /// Kind 0 sends that many bytes over TCP. Kind 1 sends them as a motion command over UDP. Kind 2 lets `length`
-/// milliseconds pass. Checks that every commanded joint position was reached within the limits.
+/// milliseconds pass. Checks that the commanded joint positions never violate the limits.
 pub fn client(bytes: &[u8]) {
     for version in [FciVersion::V5, FciVersion::V10] {
         commanded(version, bytes);
     }
 }
 
-/// Commanded joints before and after the actions, see [`client`].
+/// Commanded joint states before and after the actions, see [`client`].
 pub(crate) fn commanded(version: FciVersion, mut bytes: &[u8]) -> (CommandedJoints, CommandedJoints) {
     let limits = if version == FciVersion::V5 { Limits::panda() } else { Limits::fr3() };
     let mut server = server(version, limits.clone());

@@ -1,0 +1,309 @@
+//! A live run as an operator sees it: latency of pictures and of keyframes, training speed, and accuracy over time, with
+//! correct and with wrong calibration.
+//!
+//! All times are on the clock of this process, from mid-exposure of an image to the arrival of a picture at its viewer.
+
+use crate::findings::Findings;
+use crate::viewer::{ReceivedPicture, Viewer};
+use capture::Rig;
+use capture::config::Parent;
+use keyframe::counted;
+use kinematics::Transform;
+use kinematics::quantile::{Rank, quantile};
+use kinematics::random::Random;
+use nalgebra::{UnitQuaternion, UnitVector3, Vector3};
+use serde::Serialize;
+use session::chart::{Axis, Chart, Line, Point, Scale};
+use session::{KeyframeTimes, Live, Table};
+use std::fmt;
+use std::time::{Duration, Instant};
+
+/// An error of the hand-eye calibration.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct HandEyeError {
+    /// Rotation, degrees.
+    pub degrees: f64,
+    /// Translation, millimeters.
+    pub millimeters: f64,
+    /// Selects the random directions of both.
+    pub seed: u64,
+}
+
+impl HandEyeError {
+    /// Moves all cameras on the flange: each by the same error, in its own frame.
+    pub fn apply(self, rig: &mut Rig) {
+        let mut random = Random::new(self.seed);
+        let mut direction = || UnitVector3::new_normalize(Vector3::from_fn(|_, _| random.normal()));
+        let rotation = UnitQuaternion::from_axis_angle(&direction(), self.degrees.to_radians());
+        let translation = direction().into_inner() * self.millimeters * 1e-3;
+        let error = Transform::from_parts(translation.into(), rotation);
+        for camera in rig.cameras.iter_mut().filter(|camera| camera.parent == Parent::Flange) {
+            camera.parent_from_camera *= error;
+        }
+    }
+}
+
+impl fmt::Display for HandEyeError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "hand-eye off by {} degrees, {} mm (seed {})", self.degrees, self.millimeters, self.seed)
+    }
+}
+
+/// The conditions of one run.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct Conditions {
+    /// Number of viewers that request pictures back to back.
+    pub n_viewers: u64,
+    /// Error added to the calibration of the recording, if any.
+    pub hand_eye_error: Option<HandEyeError>,
+}
+
+impl fmt::Display for Conditions {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&counted(self.n_viewers, "viewer"))?;
+        self.hand_eye_error.map_or(Ok(()), |error| write!(f, ", {error}"))
+    }
+}
+
+/// Median and 99th percentile of durations, milliseconds.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct Latency {
+    /// Median.
+    pub p50: f64,
+    /// 99th percentile.
+    pub p99: f64,
+    /// Number of durations.
+    pub n: usize,
+}
+
+impl Latency {
+    /// `None` if there are no durations.
+    fn of(millis: impl IntoIterator<Item = f64>) -> Option<Self> {
+        let mut millis: Vec<f64> = millis.into_iter().collect();
+        let p50 = quantile(&mut millis, 0.5, Rank::Lower)?;
+        Some(Self { p50, p99: quantile(&mut millis, 0.99, Rank::Lower)?, n: millis.len() })
+    }
+}
+
+/// The measurements of one run.
+#[derive(Clone, Debug, Serialize)]
+pub struct LiveRun {
+    /// Its conditions.
+    pub conditions: Conditions,
+    /// Training time, seconds.
+    pub seconds: f64,
+    /// Number of optimizer steps.
+    pub steps: u64,
+    /// Steps per second of training time.
+    pub steps_per_sec: f64,
+    /// Number of primitives of the model at the end, such as splats.
+    pub primitives: u64,
+    /// Number of keyframes at the end.
+    pub keyframes: usize,
+    /// Durations by name, in the order in which they occur.
+    pub latencies: Vec<(&'static str, Latency)>,
+    /// Training seconds and PSNR in dB at the scheduled evaluations.
+    pub psnr: Vec<(f64, f64)>,
+}
+
+impl LiveRun {
+    /// Evaluates a run that is over, before its viewers disconnect.
+    #[must_use]
+    pub fn of(conditions: Conditions, live: &Live, viewers: &[Viewer]) -> Self {
+        let session = &live.sessions()[0];
+        let (progress, seconds) = (session.progress(), session.secs());
+        let pictures: Vec<Vec<ReceivedPicture>> = viewers.iter().map(Viewer::pictures).collect();
+        Self {
+            conditions,
+            seconds,
+            steps: progress.step,
+            steps_per_sec: progress.step as f64 / seconds.max(1e-9),
+            primitives: progress.primitives,
+            keyframes: live.keyframes().len(),
+            latencies: latencies(&pictures, live.ledger().keyframes()),
+            psnr: session
+                .evaluations()
+                .iter()
+                .filter_map(|evaluation| Some((evaluation.seconds, evaluation.scores.psnr?)))
+                .collect(),
+        }
+    }
+
+    /// A duration by name.
+    #[must_use]
+    pub fn latency(&self, name: &str) -> Option<Latency> {
+        self.latencies.iter().find(|(known, _)| *known == name).map(|(_, latency)| *latency)
+    }
+}
+
+/// The durations of all pictures, and those of all keyframes up to the first viewer.
+fn latencies(pictures: &[Vec<ReceivedPicture>], keyframes: &[KeyframeTimes]) -> Vec<(&'static str, Latency)> {
+    let of_pictures =
+        |name, millis: fn(&ReceivedPicture) -> f64| (name, Latency::of(pictures.iter().flatten().map(millis)));
+    let since_shutter = |at: &dyn Fn(&KeyframeTimes) -> Option<Instant>| {
+        let millis_of =
+            |keyframe: &KeyframeTimes| Some(millis(at(keyframe)?.checked_duration_since(keyframe.input.captured?)?));
+        Latency::of(keyframes.iter().filter_map(millis_of))
+    };
+    let to_picture = pictures.first().and_then(|pictures| Latency::of(shutter_to_picture(pictures, keyframes)));
+    let named = [
+        of_pictures("request to complete picture", |picture| millis(picture.complete - picture.requested)),
+        of_pictures("request to first stage", |picture| millis(picture.first_stage - picture.requested)),
+        of_pictures("picture: waiting", |picture| picture.waited_millis),
+        of_pictures("picture: rendering", |picture| picture.render_millis),
+        of_pictures("picture: encoding", |picture| picture.encode_millis),
+        of_pictures("picture: transfer", |picture| {
+            let on_server = picture.waited_millis + picture.render_millis + picture.encode_millis;
+            (millis(picture.complete - picture.requested) - on_server).max(0.0)
+        }),
+        ("shutter to arrival", since_shutter(&|keyframe| Some(keyframe.input.arrived))),
+        ("shutter to keyframe", since_shutter(&|keyframe| Some(keyframe.input.queued))),
+        ("shutter to model", since_shutter(&|keyframe| Some(keyframe.pushed))),
+        ("shutter to first step", since_shutter(&|keyframe| keyframe.trained)),
+        ("shutter to picture", to_picture),
+    ];
+    named.into_iter().filter_map(|(name, latency)| Some((name, latency?))).collect()
+}
+
+/// For each keyframe, the time from mid-exposure until the viewer had the first picture that contains it, milliseconds.
+fn shutter_to_picture<'a>(
+    pictures: &'a [ReceivedPicture],
+    keyframes: &'a [KeyframeTimes],
+) -> impl Iterator<Item = f64> + 'a {
+    let mut rest = pictures;
+    (1..).zip(keyframes).filter_map(move |(n, keyframe)| {
+        let first = rest.iter().position(|picture| picture.n_keyframes >= n)?;
+        rest = &rest[first..];
+        Some(millis(rest[0].complete.checked_duration_since(keyframe.input.captured?)?))
+    })
+}
+
+fn millis(duration: Duration) -> f64 {
+    duration.as_secs_f64() * 1e3
+}
+
+/// A table and a chart of runs on the same recording.
+///
+/// * `input`: the recording and the pictures, for the page.
+#[must_use]
+pub fn findings(input: &str, runs: &[LiveRun]) -> Findings {
+    let mut rows: Vec<Vec<String>> = Vec::new();
+    let mut add = |name: &str, value: &dyn Fn(&LiveRun) -> String| {
+        rows.push([name.to_owned()].into_iter().chain(runs.iter().map(value)).collect());
+    };
+    let mut names: Vec<&str> = Vec::new();
+    for (name, _) in runs.iter().flat_map(|run| &run.latencies) {
+        if !names.contains(name) {
+            names.push(name);
+        }
+    }
+    for name in names {
+        add(&format!("{name}, ms"), &|run| {
+            run.latency(name).map_or(String::new(), |latency| format!("{:.1} / {:.1}", latency.p50, latency.p99))
+        });
+    }
+    add("training steps per second", &|run| format!("{:.1}", run.steps_per_sec));
+    add("primitives", &|run| run.primitives.to_string());
+    add("keyframes", &|run| run.keyframes.to_string());
+    let marks = runs.iter().map(|run| &run.psnr).max_by_key(|psnr| psnr.len());
+    for (ix, (seconds, _)) in marks.into_iter().flatten().enumerate() {
+        add(&format!("test PSNR at {seconds:.1} s, dB"), &|run| {
+            run.psnr.get(ix).map_or(String::new(), |(_, psnr)| format!("{psnr:.2}"))
+        });
+    }
+    let line = |run: &LiveRun| Line {
+        label: run.conditions.to_string(),
+        points: run.psnr.iter().map(|&(x, y)| Point { x, y, low: y, high: y }).collect(),
+        is_peer: false,
+    };
+    Findings {
+        name: "live",
+        title: "Live run".to_owned(),
+        sentences: vec![
+            format!("{input}. Durations are medians / 99th percentiles."),
+            "A keyframe is in the model from the first step after it was added. The shutter is the middle of the exposure."
+                .to_owned(),
+        ],
+        charts: vec![(
+            "",
+            Chart {
+                title: "Accuracy of a live run".to_owned(),
+                subtitle: input.to_owned(),
+                x: Axis { label: "seconds of training".to_owned(), scale: Scale::Log, ticks: Vec::new() },
+                y: Axis { label: "test PSNR, dB".to_owned(), scale: Scale::Linear, ticks: Vec::new() },
+                lines: runs.iter().map(line).filter(|line| !line.points.is_empty()).collect(),
+                thresholds: Vec::new(),
+                markers: Vec::new(),
+            },
+        )],
+        tables: vec![Table {
+            title: "Live run".to_owned(),
+            head: ["quantity".to_owned()].into_iter().chain(runs.iter().map(|run| run.conditions.to_string())).collect(),
+            rows,
+        }],
+        numbers: serde_json::json!({ "input": input, "runs": runs }),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use capture::InputTimes;
+    use kinematics::Stamp;
+
+    fn at(began: Instant, after_millis: u64) -> Instant {
+        began + Duration::from_millis(after_millis)
+    }
+
+    fn keyframe(began: Instant, captured_millis: u64) -> KeyframeTimes {
+        let captured = at(began, captured_millis);
+        KeyframeTimes {
+            camera: "wrist".into(),
+            stamp: Stamp(0),
+            input: InputTimes { captured: Some(captured), arrived: at(captured, 5), queued: at(captured, 8) },
+            pushed: at(captured, 12),
+            pushed_at_step: 0,
+            trained: Some(at(captured, 20)),
+        }
+    }
+
+    fn picture(began: Instant, requested_millis: u64, complete_millis: u64, n_keyframes: u64) -> ReceivedPicture {
+        ReceivedPicture {
+            requested: at(began, requested_millis),
+            first_stage: at(began, requested_millis + 1),
+            complete: at(began, complete_millis),
+            waited_millis: 1.0,
+            render_millis: 2.0,
+            encode_millis: 3.0,
+            n_keyframes,
+        }
+    }
+
+    #[test]
+    fn keyframes_are_seen_in_the_first_picture_that_contains_them() {
+        let began = Instant::now();
+        let keyframes = [keyframe(began, 0), keyframe(began, 10), keyframe(began, 100), keyframe(began, 200)];
+        let pictures = [picture(began, 0, 20, 0), picture(began, 20, 50, 2), picture(began, 50, 130, 3)];
+        let seen: Vec<f64> = shutter_to_picture(&pictures, &keyframes).collect();
+        assert_eq!(seen.iter().map(|millis| millis.round()).collect::<Vec<_>>(), [50.0, 40.0, 30.0]);
+        let latencies = latencies(&[pictures.to_vec()], &keyframes);
+        let p50 = |name: &str| latencies.iter().find(|(known, _)| *known == name).expect("measured").1.p50.round();
+        assert_eq!(p50("request to complete picture"), 30.0);
+        assert_eq!(p50("picture: transfer"), 24.0);
+        assert_eq!(["shutter to arrival", "shutter to model", "shutter to first step"].map(p50), [5.0, 12.0, 20.0]);
+    }
+
+    #[test]
+    fn hand_eye_error_has_the_requested_size() {
+        let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../rigs/static-arm.toml");
+        let rig = Rig::load(&path, &[]).expect("a bundled rig file");
+        let mut wrong = rig.clone();
+        HandEyeError { degrees: 1.0, millimeters: 5.0, seed: 3 }.apply(&mut wrong);
+        let error = rig.cameras[0].parent_from_camera.inverse() * wrong.cameras[0].parent_from_camera;
+        assert!((error.rotation.angle().to_degrees() - 1.0).abs() < 1e-9);
+        assert!((error.translation.vector.norm() - 5e-3).abs() < 1e-12);
+        let mut other = rig.clone();
+        HandEyeError { degrees: 1.0, millimeters: 5.0, seed: 4 }.apply(&mut other);
+        assert_ne!(other, wrong);
+    }
+}

@@ -1,0 +1,109 @@
+//! The keys in `[base]`, and the tags that locate a base.
+
+use super::key::{Keys, choices, entry, keys};
+use super::section::Section;
+use drivers::tags::{Family, TagPlacement};
+use kinematics::Transform;
+use std::collections::BTreeMap;
+use std::net::{IpAddr, Ipv4Addr, SocketAddr};
+use toml::{Table, Value};
+
+/// Default address for base poses; it accepts data from this computer only.
+const DEFAULT_ADDRESS: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 7009);
+
+keys! {
+    /// Pose of the base and its source.
+    #[derive(Clone, Debug, PartialEq)]
+    pub struct Base {
+        /// Source of the base pose.
+        pub driver: BaseDriver = BaseDriver::Fixed;
+        /// Address on which [`BaseDriver::Udp`] listens.
+        pub address: SocketAddr = DEFAULT_ADDRESS;
+        /// Pose of a fixed base; the identity in simulation.
+        pub world_from_base: Transform = Transform::identity();
+        /// Pose rate of a simulated base, Hz.
+        pub rate_hz: f64 = 100.0, in 1.0..=1000.0;
+        /// Whether the pose is re-estimated at each station.
+        pub realign: bool = true;
+        /// Measured poses with a larger root mean square position error are discarded, meters.
+        pub max_sigma_m: f64 = 0.05, in 0.0001..=100.0;
+        /// Measured poses with a larger root mean square orientation error are discarded, radians.
+        pub max_sigma_rad: f64 = 0.03, in 0.0001..=3.2;
+        /// Family of the tags that [`BaseDriver::Tags`] detects.
+        pub tag_family: Family = Family::Tag36h11;
+        /// Sizes and poses of the tags in the world, by ID.
+        pub tags: BTreeMap<u32, TagPlacement> => BTreeMap::new();
+        /// Errors of a simulated base.
+        pub sim: BaseSim;
+    }
+
+    /// Errors of a simulated base.
+    #[derive(Clone, Debug, PartialEq)]
+    pub struct BaseSim {
+        /// Position error at the end of the path of the base, root mean square, meters.
+        pub drift_m: f64 = 0.02, in 0.0..=10.0;
+        /// The same for the orientation, radians.
+        pub drift_rad: f64 = 0.0175, in 0.0..=1.0;
+    }
+
+    /// The keys in `[base.tag.ID]`.
+    struct TagKeys {
+        size_m: f64, in 0.001..=10.0, required "side length of the tag's border, where black meets white, m";
+        world_from_tag: Transform = Transform::identity();
+    }
+}
+
+/// Source of the base pose.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum BaseDriver {
+    /// The base does not move.
+    Fixed,
+    /// AprilTags in the images of cameras on the base or arm.
+    Tags,
+    /// Reserved for estimating the pose from color and depth images. This version cannot open it.
+    Rgbd,
+    /// Datagrams from another program.
+    Udp,
+    /// The simulator.
+    Sim,
+}
+
+choices! {
+    BaseDriver { Fixed = "fixed", Tags = "tags", Rgbd = "rgbd", Udp = "udp", Sim = "sim" }
+    Family {
+        Tag36h11 = "tag36h11", Tag25h9 = "tag25h9", Tag16h5 = "tag16h5", Standard41h12 = "tagStandard41h12",
+        Standard52h13 = "tagStandard52h13"
+    }
+}
+
+pub(super) fn read(mut keys: Section<'_>) -> Option<Base> {
+    let mut base = Base::read_keys(&mut keys)?;
+    let tags = keys.named_sections("tag").into_iter().filter_map(|(id, keys)| tag(&id, base.tag_family, keys));
+    base.tags = tags.collect();
+    if base.driver == BaseDriver::Tags && base.tags.is_empty() {
+        keys.missing("tag", "a table [base.tag.ID] for each tag, with size_m and world_from_tag");
+    }
+    keys.end();
+    Some(base)
+}
+
+/// Reads a tag and its ID. Reports an invalid value and returns `None`.
+fn tag(id: &str, family: Family, keys: Section<'_>) -> Option<(u32, TagPlacement)> {
+    let number = id.parse().ok().filter(|number: &u32| number.to_string() == id && *number < family.n_tags());
+    let allowed = format!("ID of a tag in its family, 0 to {}, as the name of the table", family.n_tags() - 1);
+    let id = number.or_else(|| keys.invalid("id", &Value::from(id), &allowed));
+    let TagKeys { size_m, world_from_tag } = keys.read()?;
+    Some((id?, TagPlacement { size_m, world_from_tag }))
+}
+
+pub(super) fn write(base: &Base) -> Table {
+    let tag = |(id, tag): (&u32, &TagPlacement)| {
+        let TagPlacement { size_m, world_from_tag } = *tag;
+        entry(&id.to_string(), &TagKeys { size_m, world_from_tag })
+    };
+    let mut table = base.write_keys();
+    if !base.tags.is_empty() {
+        table.insert("tag".to_owned(), Value::Table(base.tags.iter().filter_map(tag).collect()));
+    }
+    table
+}

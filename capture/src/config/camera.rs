@@ -1,0 +1,285 @@
+//! The keys in `[camera.NAME]`.
+
+use super::key::{Choice, Keys, choices, entry, keys};
+use super::lens::PLACEHOLDER_INTRINSICS;
+use super::section::Section;
+use drivers::realsense::{Filter, Pace, Stream};
+use drivers::v4l2::{Delivery, V4l2Format};
+use kinematics::{Intrinsics, Stamp, Transform};
+use std::ops::RangeInclusive;
+use std::path::PathBuf;
+use std::sync::Arc;
+use toml::Table;
+
+/// Range of control values. The limits of the camera are checked when it is opened.
+const CONTROL_RANGE: RangeInclusive<i32> = -1_000_000..=1_000_000;
+
+keys! {
+    /// One color camera, optionally with depth.
+    #[derive(Clone, Debug, PartialEq)]
+    pub struct Camera {
+        /// Name of its table in the rig file: letters, digits, `_` and `-`.
+        pub name: Arc<str> => "".into();
+        /// Driver of the camera.
+        pub driver: CameraDriver, required "realsense, v4l2, nokhwa or sim";
+        /// Path or serial number; empty if the driver needs none.
+        pub device: String = String::new();
+        /// Frame rate, Hz.
+        pub rate_hz: f64, in 0.01..=1000.0, required "images per second";
+        /// Exposure time, microseconds, at most one frame period. `None`: automatic; the exposure time of each image is
+        /// then known only if the camera reports it.
+        pub exposure_micros: Option<f64>, in 0.0..=period_micros(rate_hz);
+        /// Time from the first to the last row, microseconds, at most one frame period; `None` if unknown, 0 for a
+        /// global shutter.
+        pub readout_micros: Option<f64>, in 0.0..=period_micros(rate_hz);
+        /// Time added to a stamp to get mid-exposure; `None` if unknown.
+        pub stamp_to_mid_exposure: Option<TimeOffset> as "stamp_to_mid_exposure_millis";
+        /// Frame to which the camera is attached.
+        pub parent: Parent, required "flange, base or world";
+        /// Extrinsics: pose of the optical frame in the frame of `parent`.
+        pub parent_from_camera: Transform = Transform::identity();
+        /// Lens and size of the color images.
+        pub intrinsics: Intrinsics = PLACEHOLDER_INTRINSICS;
+        /// Depth images, if the camera delivers them.
+        pub depth: Option<Depth> => None;
+        /// Settings of [`CameraDriver::V4l2`] and [`CameraDriver::Nokhwa`].
+        pub v4l2: V4l2;
+        /// Settings of [`CameraDriver::Realsense`].
+        pub realsense: Realsense;
+        /// Imperfections of [`CameraDriver::Sim`].
+        pub sim: CameraSim;
+    }
+
+    /// Settings of a camera with the driver `v4l2`, besides its exposure.
+    #[derive(Clone, Debug, PartialEq)]
+    pub struct V4l2 {
+        /// Pixel format. `None`: the best available format.
+        pub format: Option<V4l2Format>;
+        /// Gain in counts of the camera. `None`: automatic.
+        pub gain: Option<i32>, in CONTROL_RANGE;
+        /// Brightness in counts of the camera. `None`: unchanged.
+        pub brightness: Option<i32>, in CONTROL_RANGE;
+        /// Color temperature, kelvin. `None`: automatic.
+        pub white_balance_kelvin: Option<i32>, in 1000..=20_000;
+        /// Which of the waiting images is delivered next.
+        pub delivery: Delivery = Delivery::Every;
+        /// How long to search for a disconnected camera, seconds.
+        pub reconnect_secs: f64 = 30.0, in 0.0..=86_400.0;
+    }
+
+    /// Settings of a camera with the driver `realsense`, besides its exposure.
+    #[derive(Clone, Debug, PartialEq)]
+    pub struct Realsense {
+        /// Recorded file that is played back instead of a camera; empty for a camera.
+        pub file: PathBuf = PathBuf::new();
+        /// Speed and stamps of the playback.
+        pub pace: Pace = Pace::default();
+        /// Offset added to the stamps of the file with [`Pace::Clock`], nanoseconds.
+        pub clock_offset_nanos: i64 = 0, in -i64::MAX..=i64::MAX;
+        /// Stream of the images that are not depth.
+        pub stream: Stream = Stream::default();
+        /// Gain in counts of the camera. `None`: automatic.
+        pub gain: Option<i32>, in CONTROL_RANGE;
+        /// Brightness in counts of the camera. `None`: unchanged.
+        pub brightness: Option<i32>, in CONTROL_RANGE;
+        /// Color temperature, kelvin. `None`: automatic.
+        pub white_balance_kelvin: Option<i32>, in 1000..=20_000;
+        /// Name of a preset of the depth camera. `None`: unchanged.
+        pub preset: Option<String>;
+        /// Power of the projector or laser in units of the camera. `None`: unchanged.
+        pub laser_power: Option<f64>, in 0.0..=1000.0;
+        /// Depth filters in the order of their application, without duplicates.
+        pub filters: Vec<Filter> = Vec::new();
+        /// How long to search for a disconnected camera, seconds.
+        pub reconnect_secs: f64 = 30.0, in 0.0..=86_400.0;
+        /// Calibration values that are unknown until the camera is opened and reports them.
+        pub unknown: UnknownCalibration => UnknownCalibration::default();
+    }
+
+    /// A measured time offset.
+    #[derive(Clone, Debug, PartialEq)]
+    pub struct TimeOffset {
+        /// Time added to the stamps of the device, milliseconds.
+        pub value_millis: f64 as "value", in -1000.0..=1000.0, required "milliseconds from the stamp to mid-exposure";
+        /// Standard deviation of the value, milliseconds.
+        pub sigma_millis: f64 as "sigma" = 0.0, in 0.0..=1000.0;
+        /// Description of how the offset was measured; may be empty.
+        pub source: String = String::new();
+    }
+
+    /// Depth images of a camera.
+    #[derive(Clone, Debug, PartialEq)]
+    pub struct Depth {
+        /// Device of the depth images with the driver `v4l2`; empty if the driver needs none.
+        pub device: String = String::new();
+        /// Meters per count if the device does not report it.
+        pub meters_per_count: Option<f64>, in 1e-6..=0.1;
+        /// Lens and size of the depth images.
+        pub intrinsics: Intrinsics = PLACEHOLDER_INTRINSICS;
+        /// Pose of the optical frame of the depth images in the optical frame of the color images.
+        pub camera_from_depth: Transform = Transform::identity();
+        /// Scale factor for the readings.
+        pub factor: f64 = 1.0, in 0.5..=2.0;
+        /// Smaller readings, after scaling, are discarded, meters.
+        pub min_m: f64 = 0.1, in 0.0..=100.0;
+        /// Larger readings, after scaling, are discarded, meters.
+        pub max_m: f64 = 6.0, in min_m..=1000.0;
+    }
+
+    /// Errors of a simulated camera.
+    #[derive(Clone, Debug, PartialEq)]
+    pub struct CameraSim {
+        /// Standard deviation of the noise at mid-gray, 8-bit levels.
+        pub noise_sigma: f64 = 2.0, in 0.0..=100.0;
+        /// Fraction of the noise variance that is shot noise.
+        pub shot_frac: f64 = 0.7, in 0.0..=1.0;
+        /// Instants averaged over the exposure; 1 means no motion blur.
+        pub blur_samples: u32 = 1, in 1..=64;
+        /// Time from the end of the readout to delivery, milliseconds.
+        pub latency_millis: f64 = 20.0, in 0.0..=10_000.0;
+        /// Fraction of images that are lost.
+        pub dropped_frac: f64 = 0.0, in 0.0..=0.9;
+        /// Rendered samples per pixel along each axis.
+        pub supersample: u32 = 1, in 1..=4;
+        /// Standard deviation of the depth noise at 1 m, meters; it grows with the square of the depth.
+        pub depth_noise_sigma_m: f64 = 0.0015, in 0.0..=1.0;
+        /// Fraction of depth pixels without a reading.
+        pub depth_hole_frac: f64 = 0.02, in 0.0..=0.9;
+        /// Meters per count of the depth images.
+        pub meters_per_count: f64 = 1e-4, in 1e-6..=0.1;
+    }
+}
+
+impl Camera {
+    /// Mid-exposure time of an image with this device stamp.
+    pub(crate) fn mid_exposure(&self, device_stamp: Stamp) -> Stamp {
+        let offset = self.stamp_to_mid_exposure.as_ref();
+        offset.map_or(device_stamp, |offset| device_stamp.plus_secs(offset.value_millis * 1e-3))
+    }
+}
+
+/// Driver of a camera.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum CameraDriver {
+    /// A RealSense camera through librealsense2, or a file that it recorded.
+    Realsense,
+    /// A V4L2 device.
+    V4l2,
+    /// A webcam through nokhwa.
+    Nokhwa,
+    /// The simulator.
+    Sim,
+}
+
+/// The frame to which a camera is attached.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Parent {
+    /// The flange of the arm, [`Arm::flange_link`](super::Arm::flange_link).
+    Flange,
+    /// The base of the robot.
+    Base,
+    /// The world: the camera does not move.
+    World,
+}
+
+/// Calibration values that are missing in the rig file and not yet reported by the camera. Until then, the rig contains
+/// placeholders that must not be used.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct UnknownCalibration {
+    /// Whether [`Camera::intrinsics`] are unknown, except for the size.
+    pub intrinsics: bool,
+    /// Whether [`Depth::intrinsics`] are unknown, except for the size.
+    pub depth_intrinsics: bool,
+    /// Whether [`Depth::camera_from_depth`] is unknown.
+    pub camera_from_depth: bool,
+}
+
+choices! {
+    CameraDriver { Realsense = "realsense", V4l2 = "v4l2", Nokhwa = "nokhwa", Sim = "sim" }
+    Parent { Flange = "flange", Base = "base", World = "world" }
+    Delivery { Every = "every", Newest = "newest" }
+    Pace { RealTime = "real_time", Fast = "fast", Clock = "clock" }
+    Stream { Color = "color", Infrared = "infrared" }
+    Filter { Spatial = "spatial", Temporal = "temporal", HoleFilling = "hole_filling" }
+}
+
+impl Choice for V4l2Format {
+    const NAMES: &'static [(&'static str, Self)] = &Self::COLOR_FORMATS;
+}
+
+/// The time from one image to the next at this frame rate.
+fn period_micros(rate_hz: Option<f64>) -> f64 {
+    1e6 / rate_hz.unwrap_or(1.0)
+}
+
+pub(super) fn read(name: &str, mut keys: Section<'_>) -> Option<Camera> {
+    keys.check_name(name);
+    let mut unknown = UnknownCalibration { intrinsics: !keys.has("intrinsics"), ..UnknownCalibration::default() };
+    let size_px = keys.required::<[u32; 2]>("size_px", (), "width and height of the images");
+    let rectified = keys.get("rectified", ()).unwrap_or(false);
+    let camera = Camera::read_keys(&mut keys);
+    // RealSense cameras report their intrinsics.
+    let reports_intrinsics = camera.as_ref().is_some_and(|camera| camera.driver == CameraDriver::Realsense);
+    if unknown.intrinsics && !reports_intrinsics {
+        keys.missing("intrinsics", "focal_px, principal_px and, for a lens with distortion, lens and distortion");
+    }
+    let lens = camera.as_ref().map_or(PLACEHOLDER_INTRINSICS, |camera| camera.intrinsics.clone());
+    let intrinsics = Intrinsics {
+        size_px: size_px.unwrap_or(lens.size_px),
+        rectified: if unknown.intrinsics { lens.rectified } else { rectified },
+        ..lens
+    };
+    let depth = keys.optional_section("depth").map(|keys| depth(keys, &intrinsics, &mut unknown));
+    keys.end();
+    let mut camera = Camera { name: name.into(), intrinsics, depth: depth.flatten(), ..camera? };
+    if reports_intrinsics {
+        camera.realsense.unknown = unknown;
+    }
+    Some(camera)
+}
+
+fn depth(mut keys: Section<'_>, color: &Intrinsics, unknown: &mut UnknownCalibration) -> Option<Depth> {
+    unknown.depth_intrinsics = !keys.has("intrinsics");
+    unknown.camera_from_depth = !keys.has("camera_from_depth");
+    let size_px = keys.get("size_px", ()).unwrap_or(color.size_px);
+    let rectified = keys.get("rectified", ()).unwrap_or(color.rectified);
+    let depth = Depth::read_keys(&mut keys);
+    keys.end();
+    let depth = depth?;
+    let lens = match unknown.depth_intrinsics {
+        // Depth of the same size as the color image is registered to it; depth of another size is assumed to have the
+        // same field of view.
+        true if size_px == color.size_px => color.clone(),
+        true => color.resized(size_px),
+        false => depth.intrinsics,
+    };
+    Some(Depth { intrinsics: Intrinsics { size_px, rectified, ..lens }, ..depth })
+}
+
+/// Writes the keys of a camera, without calibration that only the camera reports.
+pub(super) fn write(camera: &Camera) -> Table {
+    let Camera { intrinsics, realsense, .. } = camera;
+    let mut table = camera.write_keys();
+    table.extend(entry("size_px", &intrinsics.size_px));
+    table.extend(entry("rectified", &(intrinsics.rectified && !realsense.unknown.intrinsics)));
+    if realsense.unknown.intrinsics {
+        table.remove("intrinsics");
+    }
+    if let Some(depth) = &camera.depth {
+        table.insert("depth".to_owned(), write_depth(depth, realsense.unknown).into());
+    }
+    table
+}
+
+fn write_depth(depth: &Depth, unknown: UnknownCalibration) -> Table {
+    let mut table = depth.write_keys();
+    table.extend(entry("size_px", &depth.intrinsics.size_px));
+    table.extend(entry("rectified", &depth.intrinsics.rectified));
+    if unknown.depth_intrinsics {
+        table.remove("intrinsics");
+    }
+    if unknown.camera_from_depth {
+        table.remove("camera_from_depth");
+    }
+    table
+}

@@ -1,0 +1,95 @@
+//! Reads the text of a rig file into a checked rig, and writes the effective rig file.
+
+use super::key::entry;
+use super::section::{ParseContext, Section};
+use super::{ConfigError, Override, Rig, arm, base, camera, scanner};
+use toml::{Table, Value};
+
+/// Robot description of a rig without an arm, if the rig file names none.
+const EMPTY_URDF: &str = r#"<robot name="none"><link name="base"/></robot>"#;
+
+/// Reads a rig; `read_urdf` returns the robot description for the path in the file.
+pub(super) fn read(
+    file: &str,
+    text: &str,
+    overrides: &[Override],
+    read_urdf: impl FnOnce(&str) -> Result<String, ConfigError>,
+) -> Result<Rig, ConfigError> {
+    let (rig, context) = keys(file, text, overrides)?;
+    if let Some(problem) = context.into_problem() {
+        return Err(problem);
+    }
+    let (mut rig, urdf_path) = rig.expect("without problems, there is a rig");
+    rig.arm.urdf_text = if urdf_path.is_empty() { EMPTY_URDF.to_owned() } else { read_urdf(&urdf_path)? };
+    arm::resolve_joints(file, &mut rig.arm)?;
+    Ok(rig)
+}
+
+/// Reads all keys. Returns the rig without its robot description, the path of the description, and the problems found.
+/// Without problems, the rig is present.
+pub(super) fn keys(
+    file: &str,
+    text: &str,
+    overrides: &[Override],
+) -> Result<(Option<(Rig, String)>, ParseContext), ConfigError> {
+    let context = ParseContext::new(file, text, overrides.iter().map(|flag| flag.key.to_owned()).collect())?;
+    let syntax =
+        |e: toml::de::Error| ConfigError::Syntax { file: file.to_owned(), line: 1, message: e.message().to_owned() };
+    let mut table: Table = toml::from_str(text).map_err(syntax)?;
+    for flag in overrides {
+        set(&mut table, flag.key, flag.value.clone());
+    }
+    let root = Section::root(&context, table);
+    Ok((rig(root), context))
+}
+
+fn rig(mut root: Section<'_>) -> Option<(Rig, String)> {
+    let arm = arm::read(root.section("arm"));
+    let base = base::read(root.section("base"));
+    let cameras = root.named_sections("camera");
+    if cameras.is_empty() {
+        root.missing("camera", "at least one table [camera.NAME]");
+    }
+    let cameras: Vec<_> = cameras.into_iter().map(|(name, keys)| camera::read(&name, keys)).collect();
+    let scanners = root.named_sections("range");
+    let scanners: Vec<_> = scanners.into_iter().map(|(name, keys)| scanner::read(&name, keys)).collect();
+    let join = root.get_optional("join", ());
+    let train = root.get_optional("train", ());
+    let sim = root.get_optional("sim", ());
+    root.end();
+    let (arm, urdf_path) = arm?;
+    let cameras = cameras.into_iter().collect::<Option<_>>()?;
+    let scanners = scanners.into_iter().collect::<Option<_>>()?;
+    let rig = Rig { arm, base: base?, cameras, scanners, join: join?, train: train?, sim: sim? };
+    Some((rig, urdf_path))
+}
+
+/// Sets the value of a dotted key and creates missing tables.
+fn set(table: &mut Table, key: &str, value: Value) {
+    match key.split_once('.') {
+        None => {
+            table.insert(key.to_owned(), value);
+        }
+        Some((parent, rest)) => {
+            let inner = table.entry(parent.to_owned()).or_insert_with(|| Value::Table(Table::new()));
+            if let Value::Table(inner) = inner {
+                set(inner, rest, value);
+            }
+        }
+    }
+}
+
+/// Writes the effective rig file, which contains every key of a checked rig. Reading it gives the same rig.
+pub(super) fn write(rig: &Rig) -> String {
+    let cameras = rig.cameras.iter().map(|camera| (camera.name.to_string(), Value::Table(camera::write(camera))));
+    let scanners = rig.scanners.iter().filter_map(|scanner| entry(&scanner.name, scanner));
+    let tables = [
+        ("arm", arm::write(&rig.arm)),
+        ("base", base::write(&rig.base)),
+        ("camera", cameras.collect()),
+        ("range", scanners.collect()),
+    ];
+    let mut file: Table = tables.into_iter().map(|(key, table)| (key.to_owned(), Value::Table(table))).collect();
+    file.extend(entry("join", &rig.join).into_iter().chain(entry("train", &rig.train)).chain(entry("sim", &rig.sim)));
+    toml::to_string(&file).expect("tables of numbers and texts always serialize")
+}

@@ -1,0 +1,34 @@
+//! The keys in `[sim]`.
+
+use super::key::keys;
+use super::train::{DEFAULT_SEED, SEED_RANGE};
+
+keys! {
+    /// Settings of the simulator, which is used with `--sim` and by drivers named `sim`.
+    #[derive(Clone, Debug, PartialEq)]
+    pub struct Sim {
+        /// Name of the scene. The simulator checks it.
+        pub scene: String = "static-arm".to_owned();
+        /// Random seed.
+        pub seed: u64 = DEFAULT_SEED, in SEED_RANGE;
+        /// Whether sensor imperfections and the drift of the base are off.
+        pub ideal: bool = false;
+        /// Whether the simulation waits for its consumer and always gives the same samples.
+        pub lockstep: bool = false;
+        /// Speed factor of the scanning motion.
+        pub speed: f64 = 1.0, in 0.01..=2.0;
+        /// Whether the camera rotates only about the vertical axis.
+        pub azimuth_only: bool = false;
+        /// Simulated time after which the samples end, seconds. `None`: unlimited.
+        pub duration_secs: Option<f64>, in 0.001..=1e6;
+        /// Number of color images of the first camera after which the samples end. `None`: unlimited.
+        pub n_images: Option<u64>, in 1..=1_000_000_000;
+        /// Whether ground truth is delivered with the images.
+        pub truth: bool = true;
+        /// Whether the ground truth includes depth without noise.
+        pub truth_depth: bool = false;
+        /// Brightness of the lights while a camera on the flange is inside the cabinet, relative to their brightness
+        /// otherwise.
+        pub light_inside_frac: f64 = 1.0, in 0.0..=4.0;
+    }
+}

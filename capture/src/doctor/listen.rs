@@ -1,0 +1,266 @@
+//! Measures rates, latencies and losses of a rig's devices, with the drivers of `run`. Nothing is moved.
+
+use super::Finding;
+use crate::config::{ArmDriver, BaseDriver, Rig};
+use crate::open::{self, Devices, Opened};
+use crate::{Join, JoinEvent, Rejection, Result, Stop};
+use drivers::{Sample, clock};
+use kinematics::Stamp;
+use kinematics::quantile::{Rank, quantile};
+use serde::Serialize;
+use std::collections::BTreeMap;
+use std::time::{Duration, Instant};
+
+/// A device is reported if its rate is below this fraction of the rate in the rig file.
+const MIN_RATE_FRAC: f64 = 0.95;
+
+/// Measurements of one device, or of the keyframes made from its images.
+#[derive(Debug, PartialEq, Serialize)]
+pub struct DeviceStatistics {
+    /// Name with the kind of device, for example `camera "wrist"`.
+    pub device: String,
+    /// Number of samples.
+    pub samples: u64,
+    /// Mean rate.
+    pub rate_hz: f64,
+    /// Rate in the rig file; `None` if it has none.
+    pub expected_hz: Option<f64>,
+    /// Images dropped by the device or the driver.
+    pub dropped: u64,
+    /// `None` for simulated devices.
+    #[serde(flatten)]
+    pub latency: Option<Latency>,
+    /// 99th percentile of the intervals between samples.
+    pub gap_p99_millis: f64,
+}
+
+/// Time from the stamp of a sample until the program receives it.
+#[derive(Debug, PartialEq, Serialize)]
+pub struct Latency {
+    /// Median.
+    pub latency_p50_millis: f64,
+    /// 99th percentile.
+    pub latency_p99_millis: f64,
+    /// Maximum.
+    pub latency_max_millis: f64,
+}
+
+/// Result of listening to all devices.
+#[derive(Debug)]
+pub struct ListenResult {
+    /// Measurements of each device.
+    pub devices: Vec<DeviceStatistics>,
+    /// Problems in the measurements.
+    pub findings: Vec<Finding>,
+}
+
+/// Raw measurements of one device.
+#[derive(Debug, Default)]
+struct Track {
+    stamps: Vec<Stamp>,
+    latency_millis: Vec<f64>,
+    dropped: u64,
+}
+
+impl Track {
+    fn note(&mut self, stamp: Stamp, now: Stamp) {
+        self.stamps.push(stamp);
+        self.latency_millis.push(now.secs_since(stamp) * 1e3);
+    }
+
+    fn summarize(mut self, device: String, expected_hz: Option<f64>, is_simulated: bool) -> DeviceStatistics {
+        let mut gaps: Vec<f64> = self.stamps.windows(2).map(|pair| pair[1].secs_since(pair[0]) * 1e3).collect();
+        let span_secs = match (self.stamps.first(), self.stamps.last()) {
+            (Some(first), Some(last)) => last.secs_since(*first),
+            _ => 0.0,
+        };
+        let quantile_of = |values: &mut [f64], frac| quantile(values, frac, Rank::Lower).unwrap_or(0.0);
+        let n_gaps = self.stamps.len().saturating_sub(1);
+        DeviceStatistics {
+            device,
+            samples: self.stamps.len() as u64,
+            rate_hz: if span_secs > 0.0 { n_gaps as f64 / span_secs } else { 0.0 },
+            expected_hz,
+            dropped: self.dropped,
+            latency: (!is_simulated).then(|| Latency {
+                latency_p50_millis: quantile_of(&mut self.latency_millis, 0.5),
+                latency_p99_millis: quantile_of(&mut self.latency_millis, 0.99),
+                latency_max_millis: quantile_of(&mut self.latency_millis, 1.0),
+            }),
+            gap_p99_millis: quantile_of(&mut gaps, 0.99),
+        }
+    }
+}
+
+/// Reads the rig's devices with the drivers of a run for `secs` seconds, or until `stop` is requested.
+///
+/// # Errors
+/// A device cannot be opened.
+pub fn listen(rig: &Rig, secs: f64, stop: &Stop) -> Result<ListenResult> {
+    let Opened { rig, mut source, .. } = open::rig(rig.clone(), Devices::Real)?;
+    let mut join = Join::new(&rig)?;
+    let mut tracks: BTreeMap<String, Track> = BTreeMap::new();
+    let mut findings = Vec::new();
+    let (began, cpu_before) = (Instant::now(), clock::process_cpu_time());
+    while !stop.requested() && began.elapsed().as_secs_f64() < secs {
+        let sample = match source.next_sample() {
+            Ok(Some(sample)) => sample,
+            Ok(None) => break,
+            Err(error) => {
+                findings.push(Finding::fail("devices", format!("{error}"), "check the device and its cable"));
+                break;
+            }
+        };
+        let now = clock::now();
+        let (device, dropped) = match &sample {
+            Sample::Image(image) if image.is_depth() => (format!("camera {:?} depth", image.camera), image.n_skipped),
+            Sample::Image(image) => (format!("camera {:?}", image.camera), image.n_skipped),
+            Sample::Joints(_) => ("arm".to_owned(), 0),
+            Sample::Base(_) => ("base".to_owned(), 0),
+            Sample::Range(scan) => (format!("range scanner {:?}", scan.scanner), 0),
+            Sample::Truth(_) | Sample::BaseTruth(_) => continue,
+        };
+        let track = tracks.entry(device).or_default();
+        track.note(sample.stamp(), now);
+        track.dropped += dropped;
+        for event in join.push(sample) {
+            if let JoinEvent::Accepted(keyframe) = event {
+                let track = tracks.entry(format!("keyframes of {:?}", keyframe.camera)).or_default();
+                track.note(keyframe.stamp, clock::now());
+            }
+        }
+    }
+    if let (Some(cpu_before), Some(cpu)) = (cpu_before, clock::process_cpu_time()) {
+        findings.push(Finding::ok("processor", cpu_message(cpu - cpu_before, began.elapsed())));
+    }
+    // A simulation has its own clock.
+    let is_simulated = open::is_any_simulated(&rig);
+    let expected = expected(&rig);
+    findings.extend(missing(&rig, &expected, &tracks));
+    let devices: Vec<_> = tracks
+        .into_iter()
+        .map(|(device, track)| {
+            let expected_hz = expected.get(&device).copied().flatten();
+            track.summarize(device, expected_hz, is_simulated)
+        })
+        .collect();
+    findings.extend(devices.iter().filter_map(problem));
+    let rejected: Vec<_> = join.counts().rejected.iter().map(|(why, n)| format!("{n} {}", why.name())).collect();
+    let n_posed = join.counts().images - join.counts().rejected.get(&Rejection::NoPose).copied().unwrap_or(0);
+    if !rejected.is_empty() {
+        let message = format!("images that did not become keyframes: {}", rejected.join(", "));
+        findings.push(if 2 * n_posed < join.counts().images {
+            let remedy =
+                "each image needs joint states, and base poses if the base moves, around its time: check their source";
+            Finding::warn("join", message, remedy)
+        } else {
+            Finding::ok("join", message)
+        });
+    }
+    Ok(ListenResult { devices, findings })
+}
+
+/// The devices of a rig with their expected rates; `None` if the rig file does not set a rate.
+fn expected(rig: &Rig) -> BTreeMap<String, Option<f64>> {
+    let mut expected = BTreeMap::new();
+    for camera in &rig.cameras {
+        expected.insert(format!("camera {:?}", camera.name), Some(camera.rate_hz));
+        if camera.depth.is_some() {
+            expected.insert(format!("camera {:?} depth", camera.name), Some(camera.rate_hz));
+        }
+    }
+    match rig.arm.driver {
+        ArmDriver::None => {}
+        ArmDriver::Franka => drop(expected.insert("arm".to_owned(), Some(1000.0))),
+        // Motors that report without polling choose their own rates.
+        _ => drop(expected.insert("arm".to_owned(), None)),
+    }
+    if rig.base.driver != BaseDriver::Fixed {
+        expected.insert("base".to_owned(), None);
+    }
+    for scanner in &rig.scanners {
+        expected.insert(format!("range scanner {:?}", scanner.name), Some(scanner.rate_hz));
+    }
+    expected
+}
+
+fn missing(rig: &Rig, expected: &BTreeMap<String, Option<f64>>, tracks: &BTreeMap<String, Track>) -> Vec<Finding> {
+    let silent = expected.keys().filter(|device| !tracks.contains_key(*device));
+    let remedy = |device: &str| match rig.base.driver {
+        BaseDriver::Tags if device == "base" => {
+            "no image gave its pose: check base.tag_family, and the sizes and poses of the tags"
+        }
+        _ => "check it and its cable",
+    };
+    silent.map(|device| Finding::fail("silent", format!("no data from {device}"), remedy(device))).collect()
+}
+
+/// Checks rate and losses of a device. Returns a finding if there is a problem.
+fn problem(statistics: &DeviceStatistics) -> Option<Finding> {
+    let DeviceStatistics { device, rate_hz, expected_hz, dropped, .. } = statistics;
+    let slow = expected_hz.filter(|expected| *rate_hz < MIN_RATE_FRAC * expected);
+    let message = match (slow, dropped) {
+        (None, 0) => return None,
+        (Some(expected), 0) => format!("{device}: {rate_hz:.1} Hz, expected {expected:.1} Hz by the rig file"),
+        (None, dropped) => format!("{device} dropped {dropped} images"),
+        (Some(expected), dropped) => {
+            format!(
+                "{device}: {rate_hz:.1} Hz, expected {expected:.1} Hz by the rig file; {dropped} images were dropped"
+            )
+        }
+    };
+    Some(Finding::warn(
+        "rate",
+        message,
+        "usual causes: low light with automatic exposure, a slow bus, a busy processor",
+    ))
+}
+
+impl std::fmt::Display for DeviceStatistics {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let Self { device, samples, rate_hz, latency, gap_p99_millis, dropped, .. } = self;
+        write!(f, "{device}: {samples} samples, {rate_hz:.1} Hz, ")?;
+        if let Some(Latency { latency_p50_millis: p50, latency_p99_millis: p99, .. }) = latency {
+            write!(f, "latency {p50:.1} ms (99 %: {p99:.1} ms), ")?;
+        }
+        write!(f, "interval at most {gap_p99_millis:.1} ms (99 %), {dropped} dropped")
+    }
+}
+
+fn cpu_message(busy: Duration, spent: Duration) -> String {
+    let busy_frac = busy.as_secs_f64() / spent.as_secs_f64().max(1e-9);
+    format!("{:.1} % of one core was busy with reading and joining", 100.0 * busy_frac)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn track(n: i64, period_millis: i64, dropped: u64) -> Track {
+        let mut track = Track { dropped, ..Track::default() };
+        for ix in 0..n {
+            let stamp = Stamp(ix * period_millis * 1_000_000);
+            // One in a hundred arrives late.
+            track.note(stamp, stamp.plus_secs(if ix % 100 == 50 { 0.5 } else { 0.01 }));
+        }
+        track
+    }
+
+    #[test]
+    fn doctor_reports_rates_latencies_and_losses() {
+        let summarize = track(301, 100, 0).summarize("camera \"wrist\"".into(), Some(10.0), false);
+        assert!((summarize.rate_hz - 10.0).abs() < 1e-9);
+        let latency = summarize.latency.as_ref().expect("not simulated");
+        assert!((latency.latency_p50_millis - 10.0).abs() < 1e-6 && (latency.latency_p99_millis - 10.0).abs() < 1e-6);
+        assert!((latency.latency_max_millis - 500.0).abs() < 1e-6);
+        assert_eq!(problem(&summarize), None);
+        assert!(summarize.to_string().contains("301 samples, 10.0 Hz, latency 10.0 ms"), "{summarize}");
+        let slow = track(301, 100, 0).summarize("camera \"wrist\"".into(), Some(15.0), false);
+        assert!(problem(&slow).is_some_and(|finding| finding.message.contains("expected 15.0 Hz")));
+        let lossy = track(301, 100, 4).summarize("camera \"wrist\"".into(), Some(10.0), false);
+        assert!(problem(&lossy).is_some_and(|finding| finding.message.contains("dropped 4 images")));
+        let nothing = Track::default().summarize("arm".into(), None, true);
+        assert_eq!((nothing.rate_hz, &nothing.latency), (0.0, &None));
+        assert!(!nothing.to_string().contains("latency"), "{nothing}");
+    }
+}

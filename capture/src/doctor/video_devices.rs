@@ -1,0 +1,79 @@
+//! Checks the permission to open video devices, and the presence of the V4L2 cameras of a rig.
+
+use super::Finding;
+#[cfg(target_os = "linux")]
+use crate::config::{Camera, CameraDriver, Rig};
+#[cfg(target_os = "linux")]
+use drivers::v4l2;
+use std::path::{Path, PathBuf};
+
+/// Checks that the video devices can be opened.
+pub(super) fn permissions(dev: &Path) -> Finding {
+    let mut nodes: Vec<PathBuf> = std::fs::read_dir(dev)
+        .into_iter()
+        .flatten()
+        .filter_map(|entry| Some(entry.ok()?.path()))
+        .filter(|path| path.file_name().is_some_and(|name| name.to_string_lossy().starts_with("video")))
+        .collect();
+    nodes.sort_unstable();
+    let denied: Vec<String> = nodes
+        .iter()
+        .filter(|node| {
+            let opened = std::fs::File::options().read(true).write(true).open(node);
+            opened.is_err_and(|error| error.kind() == std::io::ErrorKind::PermissionDenied)
+        })
+        .map(|node| node.display().to_string())
+        .collect();
+    if denied.is_empty() {
+        return Finding::ok("cameras", format!("{} video devices, all accessible", nodes.len()));
+    }
+    let message = format!("no permission to open {}", denied.join(", "));
+    Finding::warn("cameras", message, "sudo usermod -aG video $USER, then log in again")
+}
+
+/// Reports V4L2 cameras of a rig whose device node may belong to another camera after a restart.
+#[cfg(target_os = "linux")]
+pub(super) fn unstable_nodes(rig: &Rig) -> Vec<Finding> {
+    let cameras = rig.cameras.iter().filter(|camera| camera.driver == CameraDriver::V4l2);
+    let unstable = cameras.filter(|camera| camera.device.starts_with("/dev/video"));
+    let warn = |camera: &Camera| {
+        let message = format!("camera {:?}: {} may become another camera after a restart", camera.name, camera.device);
+        Finding::warn("cameras", message, "use the stable name that fieldrig devices prints")
+    };
+    unstable.map(warn).collect()
+}
+
+/// Reports V4L2 cameras of a rig that are not connected.
+#[cfg(target_os = "linux")]
+pub(super) fn missing(rig: &Rig) -> Vec<Finding> {
+    let cameras = rig.cameras.iter().filter(|camera| camera.driver == CameraDriver::V4l2);
+    let devices = cameras.flat_map(|camera| {
+        let depth = camera.depth.as_ref().map(|depth| &depth.device);
+        std::iter::once(&camera.device).chain(depth).map(move |device| (&camera.name, device))
+    });
+    let missing = devices.filter_map(|(name, device)| {
+        let problem = v4l2::check_connected(device).err()?;
+        Some(Finding::fail(
+            "cameras",
+            format!("camera {name:?}: {problem}"),
+            format!("connect it, or set camera.{name}.device to one that fieldrig devices lists"),
+        ))
+    });
+    missing.collect()
+}
+
+#[cfg(all(test, target_os = "linux"))]
+mod tests {
+    use super::*;
+    use crate::doctor::testing::bundled_rig;
+
+    #[test]
+    fn absent_camera_is_reported_by_its_device() {
+        let rig = bundled_rig(
+            "static-arm.toml",
+            &[("camera.wrist.driver", "v4l2"), ("camera.wrist.device", "no such serial")],
+        );
+        let findings = missing(&rig);
+        assert!(findings.iter().any(|finding| finding.message.contains("\"no such serial\"")), "{findings:?}");
+    }
+}

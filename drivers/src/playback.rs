@@ -1,0 +1,162 @@
+//! Plays a source in real time, as its devices delivered it.
+
+use crate::{Error, Sample, Source};
+use kinematics::Stamp;
+use std::collections::BTreeMap;
+use std::sync::{Arc, OnceLock};
+use std::time::{Duration, Instant};
+
+/// Images later than this are dropped. [`Live`](crate::Live) holds as many images of a camera at 30 Hz.
+const MAX_DELAY: Duration = Duration::from_millis(270);
+
+/// A source whose samples are returned when they are due, by their stamps and their order.
+///
+/// A sample is due as long after the first one as its stamp is, but not before the samples in front of it: an image that
+/// was recorded after the joint states of the following 30 ms is returned 30 ms after its stamp, which keeps the latency
+/// of its camera. If the caller is too slow, images are dropped and counted, as with devices.
+pub struct Playback {
+    source: Box<dyn Source>,
+    clock: PlaybackClock,
+    /// When the latest sample was due.
+    last_due: Option<Instant>,
+    /// Dropped images that are not reported yet, by camera and whether they contain depth.
+    n_dropped: BTreeMap<(Arc<str>, bool), u64>,
+}
+
+/// Relates the stamps of a [`Playback`] to the clock of this process.
+#[derive(Clone, Debug, Default)]
+pub struct PlaybackClock {
+    /// The first stamp, and when it was returned.
+    start: Arc<OnceLock<(Stamp, Instant)>>,
+}
+
+impl PlaybackClock {
+    /// When a measurement with this stamp takes place in the playback; `None` before the first sample, and for earlier
+    /// stamps that this process's clock cannot represent.
+    #[must_use]
+    pub fn instant_of(&self, stamp: Stamp) -> Option<Instant> {
+        let (first, began) = self.start.get()?;
+        let after_secs = stamp.secs_since(*first);
+        let distance = Duration::try_from_secs_f64(after_secs.abs()).ok()?;
+        if after_secs >= 0.0 { began.checked_add(distance) } else { began.checked_sub(distance) }
+    }
+}
+
+impl Playback {
+    /// Plays a source from its first sample, which is returned at once.
+    #[must_use]
+    pub fn new(source: Box<dyn Source>) -> Self {
+        Self { source, clock: PlaybackClock::default(), last_due: None, n_dropped: BTreeMap::new() }
+    }
+
+    /// The clock of this playback; it starts with the first sample.
+    #[must_use]
+    pub fn clock(&self) -> PlaybackClock {
+        self.clock.clone()
+    }
+
+    /// When a sample is due.
+    fn due(&mut self, stamp: Stamp) -> Instant {
+        self.clock.start.get_or_init(|| (stamp, Instant::now()));
+        let due = self.clock.instant_of(stamp).max(self.last_due).unwrap_or_else(Instant::now);
+        self.last_due = Some(due);
+        due
+    }
+}
+
+impl Source for Playback {
+    fn next_sample(&mut self) -> Result<Option<Sample>, Error> {
+        loop {
+            let Some(mut sample) = self.source.next_sample()? else { return Ok(None) };
+            let delay = match self.due(sample.stamp()).checked_duration_since(Instant::now()) {
+                Some(remaining) => {
+                    std::thread::sleep(remaining);
+                    Duration::ZERO
+                }
+                None => self.last_due.map_or(Duration::ZERO, |due| due.elapsed()),
+            };
+            if let Sample::Image(image) = &mut sample {
+                let key = (image.camera.clone(), image.is_depth());
+                if delay > MAX_DELAY {
+                    *self.n_dropped.entry(key).or_default() += 1 + image.n_skipped;
+                    continue;
+                }
+                image.n_skipped += self.n_dropped.remove(&key).unwrap_or_default();
+            }
+            return Ok(Some(sample));
+        }
+    }
+
+    fn n_other_samples_dropped(&self) -> u64 {
+        self.source.n_other_samples_dropped()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{Image, PixelFormat};
+    use kinematics::JointState;
+
+    struct Scripted(std::vec::IntoIter<Sample>);
+
+    impl Source for Scripted {
+        fn next_sample(&mut self) -> Result<Option<Sample>, Error> {
+            Ok(self.0.next())
+        }
+    }
+
+    fn millis(millis: i64) -> Stamp {
+        // Stamps of another computer.
+        Stamp(7_000_000_000_000 + millis * 1_000_000)
+    }
+
+    fn image(stamp: Stamp) -> Sample {
+        let data = [0; 3].into();
+        let (camera, format) = ("wrist".into(), PixelFormat::Rgb8);
+        Sample::Image(Image { camera, stamp, size_px: [1, 1], format, data, exposure_secs: None, n_skipped: 0 })
+    }
+
+    fn joints(stamp: Stamp) -> Sample {
+        Sample::Joints(JointState { stamp, position: vec![0.0], velocity: Vec::new(), effort: Vec::new() })
+    }
+
+    fn playback(samples: Vec<Sample>) -> Playback {
+        Playback::new(Box::new(Scripted(samples.into_iter())))
+    }
+
+    #[test]
+    fn samples_are_returned_when_due_and_keep_their_latency() {
+        let mut playback = playback(vec![joints(millis(0)), joints(millis(60)), image(millis(20)), joints(millis(80))]);
+        assert_eq!(playback.clock().instant_of(millis(0)), None);
+        let mut returned = Vec::new();
+        while let Some(sample) = playback.next_sample().expect("no error") {
+            returned.push((sample.stamp(), Instant::now()));
+        }
+        let began = playback.clock().instant_of(millis(0)).expect("it has begun");
+        for ((stamp, at), due_millis) in returned.iter().zip([0, 60, 60, 80]) {
+            assert!(*at >= began + Duration::from_millis(due_millis), "{stamp:?}");
+        }
+        assert_eq!(returned.iter().map(|(stamp, _)| *stamp).collect::<Vec<_>>(), [0, 60, 20, 80].map(millis));
+        assert_eq!(playback.clock().instant_of(millis(20)), Some(began + Duration::from_millis(20)));
+    }
+
+    #[test]
+    fn images_are_dropped_and_counted_if_the_caller_is_slow() {
+        let mut playback = playback(vec![
+            image(millis(0)),
+            image(millis(10)),
+            joints(millis(15)),
+            image(millis(20)),
+            image(millis(1_000)),
+        ]);
+        assert_eq!(playback.next_sample().expect("no error").map(|sample| sample.stamp()), Some(millis(0)));
+        std::thread::sleep(Duration::from_millis(20) + 2 * MAX_DELAY);
+        assert!(matches!(playback.next_sample(), Ok(Some(Sample::Joints(_)))), "joint states are kept");
+        match playback.next_sample() {
+            Ok(Some(Sample::Image(image))) => assert_eq!((image.stamp, image.n_skipped), (millis(1_000), 2)),
+            other => panic!("{other:?}"),
+        }
+        assert!(matches!(playback.next_sample(), Ok(None)));
+    }
+}

@@ -1,0 +1,227 @@
+//! The end of training: models are saved and scored, and their reports are written.
+
+use super::Session;
+use super::outcome::TrainingOutcome;
+use super::reporter::ScoredModel;
+use super::scoreboard::Scoreboard;
+use crate::checkpoints::Snapshot;
+use crate::evaluate::Scores;
+use crate::next_commands::{DataSource, SavedModel};
+use crate::{camera_list, run_folder};
+use serde::Serialize;
+use std::path::{Path, PathBuf};
+use trainer::{Method, ModelKind};
+
+/// A trained model that has been saved and scored and is still in GPU memory.
+pub struct FinishedModel {
+    /// The method.
+    pub kind: ModelKind,
+    /// The model.
+    pub method: Box<dyn Method>,
+    /// Folder of the saved model.
+    pub folder: PathBuf,
+    /// Training time, seconds.
+    pub seconds: f64,
+    /// Scores of the saved model on the test images.
+    pub scores: Scores,
+    data: DataSource,
+    n_tests: usize,
+}
+
+impl FinishedModel {
+    /// The saved model, for commands that use it.
+    #[must_use]
+    pub fn saved(&self) -> SavedModel<'_> {
+        SavedModel { kind: self.kind, folder: &self.folder, data: &self.data, n_tests: self.n_tests }
+    }
+}
+
+/// One of several sessions that end together, with its output folder and the report details specific to the command.
+pub struct EndingSession<P> {
+    /// The session.
+    pub session: Session,
+    /// Folder for the model and its report.
+    pub out: PathBuf,
+    /// Entries of the report besides scores.
+    pub details: P,
+}
+
+/// Saves the models, then scores each one, writes its report, and reports the end. Returns the models so that they can
+/// be shown.
+pub fn finish(mut endings: Vec<EndingSession<impl Serialize>>) -> crate::Result<Vec<FinishedModel>> {
+    // All models are saved before scoring, so that a second Ctrl-C during scoring loses nothing.
+    let ended_secs: Vec<f64> =
+        endings.iter_mut().map(|ending| ending.session.stop_training()).collect::<crate::Result<_>>()?;
+    let mut saved = Vec::new();
+    // The first error is returned, the others are logged.
+    let mut failed = Ok(());
+    let mut record_error = |error: crate::Error| match failed {
+        Ok(()) => failed = Err(error),
+        Err(_) => log::error!("{error:#}"),
+    };
+    for (mut ending, seconds) in endings.into_iter().zip(ended_secs) {
+        // If one model cannot be saved, the others still are.
+        match ending.session.save(&ending.out, seconds) {
+            Ok(Saved { folder, sha256, failed: error }) => {
+                ending.out = folder;
+                ending.session.write_cameras(&ending.out);
+                error.into_iter().for_each(&mut record_error);
+                saved.push((ending, seconds, sha256));
+            }
+            Err(error) => record_error(error),
+        }
+    }
+    for (ending, ..) in &mut saved {
+        if let Err(error) = ending.session.persistence.wait() {
+            record_error(
+                error.with_context(format!(
+                    "the model was saved in {}, but not the last checkpoint",
+                    ending.out.display()
+                )),
+            );
+        }
+    }
+    if saved.iter().any(|(ending, ..)| ending.session.stop.requested()) {
+        log::info!("saved; scoring the test images, Ctrl-C again skips this");
+    }
+    let mut finished = Vec::new();
+    for (EndingSession { session, out, details }, seconds, sha256) in saved {
+        match session.report_end(&out, seconds, &sha256, &details) {
+            Ok(model) => finished.push(model),
+            Err(error) => record_error(error),
+        }
+    }
+    failed.map(|()| finished)
+}
+
+/// A model on disk.
+struct Saved {
+    folder: PathBuf,
+    sha256: String,
+    /// Error of saving in the run folder, if the model was saved elsewhere.
+    failed: Option<crate::Error>,
+}
+
+impl Session {
+    /// Scores the final model without saving it.
+    pub fn score_without_saving(mut self) -> crate::Result<TrainingOutcome> {
+        let seconds = self.stop_training()?;
+        self.score_at_end(seconds)
+    }
+
+    /// Waits for queued work and returns the training time in seconds.
+    fn stop_training(&mut self) -> crate::Result<f64> {
+        self.gpu.wait()?;
+        let seconds = self.time.end_secs();
+        self.reporter.report_training_ended();
+        Ok(seconds)
+    }
+
+    /// Saves the model after this many seconds of training. If its folder cannot be written, saves it in a temporary
+    /// folder.
+    fn save(&mut self, out: &Path, seconds: f64) -> crate::Result<Saved> {
+        self.persistence.end_decisions(self.method.as_mut())?;
+        let progress = self.method.progress();
+        if progress.step > 0 && progress.primitives == 0 {
+            log::warn!("the model is empty: no observation could be used");
+        }
+        // Saving ends a trial in progress. The checkpoint holds the state before that, so that a resumed run ends the
+        // trial when it is due. A live run without new keyframes is not finished, because more may come after it is
+        // resumed.
+        let is_live = self.persistence.keeps_keyframes();
+        let is_finished = self.is_over() || (self.is_idle() && !is_live);
+        let (method, keyframes) = (self.method.as_mut(), &self.keyframes[..]);
+        let snapshot = Snapshot { method, keyframes, seconds, is_finished };
+        let checkpoint = self.persistence.take_last_checkpoint(snapshot);
+        let saved = run_folder::save_model(self.method.as_mut(), out).and_then(|()| run_folder::checkpoint_sha256(out));
+        self.persistence.write_checkpoint(checkpoint);
+        match saved {
+            Ok(sha256) => Ok(Saved { folder: out.to_owned(), sha256, failed: None }),
+            Err(error) if error.is_io() => self.save_elsewhere(out, error),
+            Err(error) => Err(error),
+        }
+    }
+
+    /// Saves the model in a temporary folder, because the folder of its run could not be written.
+    fn save_elsewhere(&mut self, out: &Path, save_error: crate::Error) -> crate::Result<Saved> {
+        let save = |method: &mut dyn Method| {
+            let folder = run_folder::make_fallback_folder()?;
+            run_folder::save_model(method, &folder)?;
+            let sha256 = run_folder::checkpoint_sha256(&folder)?;
+            Ok((folder, sha256))
+        };
+        match save(self.method.as_mut()) {
+            Ok((folder, sha256)) => {
+                let context =
+                    format!("cannot save the model in {}; it was saved in {}", out.display(), folder.display());
+                Ok(Saved { folder, sha256, failed: Some(save_error.with_context(context)) })
+            }
+            Err(error) => {
+                let error: crate::Error = error;
+                log::error!("cannot save the model in a temporary folder either: {error:#}");
+                Err(save_error.with_context(format!(
+                    "cannot save the model in {}; {}",
+                    out.display(),
+                    self.persistence.describe_unsaved()
+                )))
+            }
+        }
+    }
+
+    /// Writes the list of camera poses with the model's corrections. Without it, a viewer starts with an outside view
+    /// of the model.
+    fn write_cameras(&mut self, out: &Path) {
+        let cameras = camera_list::of_model(self.method.as_mut(), &self.keyframes);
+        if let Err(error) = camera_list::write(out, &cameras) {
+            log::warn!("{} was not written: {error:#}", camera_list::FILE);
+        }
+    }
+
+    /// Scores the saved model, writes the report, and reports the end.
+    fn report_end(
+        mut self,
+        out: &Path,
+        seconds: f64,
+        checkpoint_sha256: &str,
+        details: &impl Serialize,
+    ) -> crate::Result<FinishedModel> {
+        let outcome = self.score_at_end(seconds)?;
+        let method = self.method.as_mut();
+        // Done before profiling, which takes more steps.
+        let comparisons = self.reporter.compare(method, self.scoreboard.tests(), &outcome.per_image);
+        let passes = self.reporter.profile(method)?;
+        self.reporter.report_end(ScoredModel {
+            out,
+            checkpoint_sha256,
+            outcome: &outcome,
+            comparisons,
+            passes,
+            trials: method.report(),
+            adapter: self.gpu.describe(),
+            details,
+        })?;
+        Ok(FinishedModel {
+            kind: self.kind(),
+            method: self.method,
+            folder: out.to_owned(),
+            seconds,
+            scores: outcome.scores,
+            data: self.reporter.into_data(),
+            n_tests: outcome.per_image.len(),
+        })
+    }
+
+    fn score_at_end(&mut self, seconds: f64) -> crate::Result<TrainingOutcome> {
+        let per_image = self.without_clock(Scoreboard::score_all)?;
+        let progress = self.method.progress();
+        Ok(TrainingOutcome {
+            seconds,
+            steps: progress.step,
+            scores: Scores::mean(&per_image),
+            primitives: progress.primitives,
+            bytes: progress.bytes,
+            evaluations: self.reporter.take_evaluations(),
+            per_image,
+        })
+    }
+}

@@ -1,0 +1,227 @@
+//! What a session keeps so that it can be resumed, replayed, and continued on another device: its checkpoints, its
+//! decision log, and what a restored model needs.
+
+use crate::checkpoints::{self, CheckpointWrite, Checkpoints, Snapshot};
+use crate::decisions::DecisionLog;
+use crate::recovery::Recovery;
+use keyframe::{DepthMap, Keyframe};
+use kinematics::Stamp;
+use std::path::Path;
+use std::sync::Arc;
+use trainer::checkpoint::Checkpoint;
+use trainer::gpu::Gpu;
+use trainer::{Method, Resumed};
+
+/// The checkpoints and the decision log of a session, and what a restored model needs.
+#[derive(Default)]
+pub(super) struct Persistence {
+    checkpoints: Option<Checkpoints>,
+    decisions: Option<DecisionLog>,
+    recovery: Option<Recovery>,
+    /// Evicted keyframes, without pixels, that the newest checkpoint may contain. The first `n_evicted_before_last` of
+    /// them were evicted before the last checkpoint.
+    evicted: Vec<Arc<Keyframe>>,
+    n_evicted_before_last: usize,
+}
+
+impl Persistence {
+    /// Enables checkpoints; `None` disables them.
+    pub(super) fn set_checkpoints(&mut self, checkpoints: Option<Checkpoints>) {
+        self.checkpoints = checkpoints;
+    }
+
+    /// Enables the decision log.
+    pub(super) fn set_decisions(&mut self, decisions: DecisionLog) {
+        self.decisions = Some(decisions);
+    }
+
+    /// Enables recovery on another device.
+    pub(super) fn set_recovery(&mut self, recovery: Recovery) {
+        self.recovery = Some(recovery);
+    }
+
+    /// Logs that a keyframe was pushed to the model.
+    pub(super) fn log_push(&mut self, method: &mut dyn Method, keyframe: &Arc<Keyframe>) -> crate::Result<()> {
+        if let Some(decisions) = &mut self.decisions {
+            decisions.pushed(method.n_total_steps()?, keyframe);
+        }
+        Ok(())
+    }
+
+    /// Logs that a keyframe was removed from the model.
+    pub(super) fn log_removal(&mut self, method: &mut dyn Method, camera: &str, stamp: Stamp) -> crate::Result<()> {
+        if let Some(decisions) = &mut self.decisions {
+            decisions.removed(method.n_total_steps()?, camera, stamp);
+        }
+        Ok(())
+    }
+
+    /// Logs that a picture is drawn, because drawing creates splats for new keyframes.
+    pub(super) fn log_render(&mut self) {
+        if let Some(decisions) = &mut self.decisions {
+            decisions.seeded();
+        }
+    }
+
+    /// Logs that training steps were requested.
+    pub(super) fn log_step_request(&mut self) {
+        if let Some(decisions) = &mut self.decisions {
+            decisions.step_requested();
+        }
+    }
+
+    /// Ends the decision log. Write errors are logged.
+    pub(super) fn end_decisions(&mut self, method: &mut dyn Method) -> crate::Result<()> {
+        if let Some(decisions) = self.decisions.take()
+            && let Err(error) = decisions.end(method.n_total_steps()?)
+        {
+            log::warn!("{error:#}");
+        }
+        Ok(())
+    }
+
+    /// Keeps what identifies an evicted keyframe as long as the newest checkpoint may contain it.
+    pub(super) fn evict(&mut self, keyframe: &Keyframe) {
+        if self.recovery.is_some() {
+            self.evicted.push(Arc::new(without_pixels(keyframe)));
+        }
+    }
+
+    /// Starts a checkpoint if one is due.
+    pub(super) fn write_checkpoint_when_due(&mut self, snapshot: Snapshot<'_>) -> crate::Result<()> {
+        let Some(checkpoints) = &mut self.checkpoints else { return Ok(()) };
+        let method = snapshot.method;
+        if checkpoints.write_when_due(Snapshot { method: &mut *method, ..snapshot })? {
+            if let Some(decisions) = &mut self.decisions {
+                decisions.checkpoint(method.n_total_steps()?);
+            }
+            // Until this checkpoint is written, the previous one is the newest, and it contains no keyframe that was
+            // evicted before it.
+            self.evicted.drain(..self.n_evicted_before_last);
+            self.n_evicted_before_last = self.evicted.len();
+        }
+        Ok(())
+    }
+
+    /// Whether keyframes are stored with the checkpoints, because a live run has no other copy.
+    pub(super) fn keeps_keyframes(&self) -> bool {
+        self.checkpoints.as_ref().is_some_and(Checkpoints::keeps_keyframes)
+    }
+
+    /// Copies the last state for [`Self::write_checkpoint`]. Errors are logged, so that the model is still saved.
+    pub(super) fn take_last_checkpoint(&mut self, snapshot: Snapshot<'_>) -> Option<CheckpointWrite> {
+        match self.checkpoints.as_mut().map(|checkpoints| checkpoints.take(snapshot)).transpose() {
+            Ok(checkpoint) => checkpoint,
+            Err(error) => {
+                log::warn!("cannot write a checkpoint of the last state: {error:#}");
+                None
+            }
+        }
+    }
+
+    /// Writes a copy of the last state on a separate thread.
+    pub(super) fn write_checkpoint(&mut self, checkpoint: Option<CheckpointWrite>) {
+        if let (Some(checkpoints), Some(checkpoint)) = (&mut self.checkpoints, checkpoint) {
+            checkpoints.write(checkpoint);
+        }
+    }
+
+    /// Waits until no checkpoint is being written.
+    pub(super) fn wait(&mut self) -> crate::Result<()> {
+        self.checkpoints.as_mut().map_or(Ok(()), Checkpoints::wait)
+    }
+
+    /// Whether a model can be restored on another device.
+    pub(super) fn can_restore(&self) -> bool {
+        self.recovery.is_some()
+    }
+
+    /// What can be continued if the run fails now, as a sentence without a period; `None` without recovery.
+    pub(super) fn describe_recoverable(&mut self) -> Option<String> {
+        let has_checkpoint = self.has_checkpoint();
+        Some(self.recovery.as_ref()?.describe_recoverable(has_checkpoint))
+    }
+
+    /// What to continue from if the model could not be saved, as a clause for an error message.
+    pub(super) fn describe_unsaved(&mut self) -> String {
+        match self.describe_recoverable() {
+            Some(left) if self.has_checkpoint() => format!("{left}; use --out to save the model in another folder"),
+            Some(left) => left,
+            None => "there is no checkpoint either".to_owned(),
+        }
+    }
+
+    /// Whether this run has written a checkpoint.
+    fn has_checkpoint(&mut self) -> bool {
+        self.checkpoints.as_mut().is_some_and(|checkpoints| checkpoints.newest().is_some())
+    }
+
+    /// Restores the model with these keyframes on another device, from the newest checkpoint or, without one, from the
+    /// start. Begins a new decision log.
+    pub(super) fn restore(&mut self, gpu: &Arc<Gpu>, keyframes: &[Arc<Keyframe>]) -> crate::Result<Box<dyn Method>> {
+        let Some(recovery) = &self.recovery else { keyframe::bail!("this run cannot continue on another device") };
+        let written = self.checkpoints.as_mut().and_then(Checkpoints::newest).map(Path::to_owned);
+        let checkpoint = match (written, &recovery.resumed) {
+            (Some(path), _) => Some(Checkpoint::read(&path).map_err(crate::Error::from)),
+            (None, Some(folder)) => Some(checkpoints::read(folder)),
+            (None, None) => None,
+        };
+        let held: Vec<Arc<Keyframe>> = recovery.known.iter().chain(keyframes).cloned().collect();
+        let all = [&held[..], &self.evicted[..]].concat();
+        let resumed = checkpoint.map_or(Ok(None), |checkpoint| resume(gpu, checkpoint, &all))?;
+        let is_resumed = resumed.is_some();
+        let (mut method, untrained) = match resumed {
+            Some(resumed) => (resumed.method, resumed.untrained),
+            None => (recovery.model_spec.start(gpu.clone())?, held.clone()),
+        };
+        method.prepare()?;
+        let is_in = |keyframes: &[Arc<Keyframe>], keyframe_ref: &Arc<Keyframe>| {
+            keyframes.iter().any(|other| Arc::ptr_eq(other, keyframe_ref))
+        };
+        for keyframe in self.evicted.iter().filter(|keyframe| !is_in(&untrained, keyframe)) {
+            method.remove(&keyframe.camera, keyframe.stamp)?;
+        }
+        let from_step = method.n_total_steps()?;
+        // The current log belongs to a run that ended here. A new log begins, possibly in the same file.
+        if let Some(decisions) = self.decisions.take() {
+            decisions.close_unfinished();
+        }
+        let settings = recovery.settings.continued_from(is_resumed.then_some(from_step));
+        let mut decisions = DecisionLog::create(&recovery.folder, settings)?;
+        held.iter()
+            .filter(|keyframe| !is_in(&untrained, keyframe))
+            .for_each(|keyframe| decisions.restored(from_step, keyframe));
+        for keyframe in untrained.iter().filter(|keyframe| is_in(&held, keyframe)) {
+            method.push(keyframe.clone())?;
+            decisions.pushed(method.n_total_steps()?, keyframe);
+        }
+        log::info!(
+            "reopened the GPU: training continues from {}",
+            if is_resumed { format!("the checkpoint of step {from_step}") } else { "the start".to_owned() }
+        );
+        self.decisions = Some(decisions);
+        Ok(method)
+    }
+}
+
+/// Resumes a model from a checkpoint that may be unreadable; `None` if that fails for another reason than the GPU.
+fn resume(
+    gpu: &Arc<Gpu>,
+    checkpoint: crate::Result<Checkpoint>,
+    keyframes: &[Arc<Keyframe>],
+) -> crate::Result<Option<Resumed>> {
+    match checkpoint.and_then(|checkpoint| Ok(trainer::resume(gpu.clone(), &checkpoint, keyframes)?)) {
+        Ok(resumed) => Ok(Some(resumed)),
+        Err(error) if error.is_gpu_error() => Err(error),
+        Err(error) => {
+            log::warn!("cannot resume from the newest checkpoint: {error:#}");
+            Ok(None)
+        }
+    }
+}
+
+/// A keyframe without pixels, with all the data by which a checkpoint identifies it.
+fn without_pixels(keyframe: &Keyframe) -> Keyframe {
+    let depth = keyframe.depth.as_ref().map(|depth| DepthMap { depth_m: [].into(), ..depth.clone() });
+    Keyframe { rgba_srgb: [].into(), depth, truth: None, ..keyframe.clone() }
+}

@@ -1,0 +1,33 @@
+//! GPU time of the kernels of a training step.
+
+use kinematics::quantile::median;
+use std::collections::BTreeMap;
+use std::time::{Duration, Instant};
+use trainer::Method;
+use trainer::gpu::PassTiming;
+
+/// Number of steps in a profile, which reports medians.
+const N_PROFILED: usize = 21;
+/// Drivers are slow for a while after large buffers have been freed.
+const PROFILE_WARM_UP: Duration = Duration::from_millis(700);
+
+/// GPU time of each kernel in a step in milliseconds: medians over [`N_PROFILED`] steps, in order of first execution.
+pub(super) fn profile(method: &mut dyn Method) -> crate::Result<Vec<(&'static str, f64)>> {
+    let mut names: Vec<&'static str> = Vec::new();
+    let mut by_name: BTreeMap<&'static str, Vec<f64>> = BTreeMap::new();
+    let began = Instant::now();
+    while began.elapsed() < PROFILE_WARM_UP {
+        method.profile_step()?;
+    }
+    for _ in 0..N_PROFILED {
+        let mut sums: BTreeMap<&'static str, f64> = BTreeMap::new();
+        for PassTiming { name, millis } in method.profile_step()? {
+            *sums.entry(name).or_default() += millis;
+            if !names.contains(&name) {
+                names.push(name);
+            }
+        }
+        sums.into_iter().for_each(|(name, millis)| by_name.entry(name).or_default().push(millis));
+    }
+    Ok(names.into_iter().filter_map(|name| Some((name, median(by_name.get(name)?)?))).collect())
+}

@@ -1,0 +1,219 @@
+//! The reports of a session: events for its observer, `report.json`, and the report page.
+
+use super::outcome::TrainingOutcome;
+use super::profile::profile;
+use crate::error::Context;
+use crate::evaluate::{ImageScores, Scores};
+use crate::next_commands::{self, DataSource, SavedModel};
+use crate::observer::{DoneEvent, Evaluation, FinishedReport, Observer, ProfileEvent, SessionEvent, SessionProgress};
+use crate::{report, run_folder};
+use calibration::TrialReport;
+use keyframe::Keyframe;
+use serde::Serialize;
+use std::path::Path;
+use std::sync::Arc;
+use trainer::{Method, ModelKind, Progress};
+
+/// The content of `report.json`.
+#[derive(Debug, Serialize)]
+struct Report<'a, T: Serialize> {
+    done: &'a DoneEvent<'a>,
+    adapter: String,
+    #[serde(flatten)]
+    details: &'a T,
+    /// Results of A/B trials.
+    trials: Vec<TrialReport>,
+    /// GPU time of each pass of a step in milliseconds, if profiling was requested.
+    passes: Vec<(&'static str, f64)>,
+    evaluations: &'a [Evaluation],
+    per_image: Vec<NamedScores<'a>>,
+}
+
+/// Scores of one test image with its name.
+#[derive(Debug, Serialize)]
+struct NamedScores<'a> {
+    name: String,
+    #[serde(flatten)]
+    scores: &'a ImageScores,
+}
+
+/// A model that was saved and scored, and the other contents of its report.
+pub(super) struct ScoredModel<'a, T: Serialize> {
+    /// Folder of the model.
+    pub out: &'a Path,
+    pub checkpoint_sha256: &'a str,
+    pub outcome: &'a TrainingOutcome,
+    /// Test images next to renders; without them, the page is not written.
+    pub comparisons: crate::Result<Vec<report::Comparison>>,
+    /// GPU time of each kernel in a step in milliseconds, if profiling was requested.
+    pub passes: Option<Vec<(&'static str, f64)>>,
+    /// Results of A/B trials.
+    pub trials: Vec<TrialReport>,
+    /// The GPU adapter and its driver.
+    pub adapter: String,
+    /// Entries of the report specific to the command.
+    pub details: &'a T,
+}
+
+/// Reports on one model.
+pub(super) struct Reporter {
+    kind: ModelKind,
+    data: DataSource,
+    observer: Box<dyn Observer>,
+    /// Whether to report the GPU time of each kernel.
+    profiles: bool,
+    /// The evaluations reported so far.
+    evaluations: Vec<Evaluation>,
+}
+
+impl Reporter {
+    /// Reports to an observer on a model of this kind.
+    pub(super) fn new(kind: ModelKind, observer: Box<dyn Observer>) -> Self {
+        Self { kind, data: DataSource::default(), observer, profiles: false, evaluations: Vec::new() }
+    }
+
+    /// The kind of model.
+    pub(super) fn kind(&self) -> ModelKind {
+        self.kind
+    }
+
+    /// Sets the data source for the report and the next commands.
+    pub(super) fn set_data(&mut self, data: DataSource) {
+        self.data = data;
+    }
+
+    /// The data source.
+    pub(super) fn into_data(self) -> DataSource {
+        self.data
+    }
+
+    /// Sets whether to report the GPU time of each kernel.
+    pub(super) fn set_profiles(&mut self, profiles: bool) {
+        self.profiles = profiles;
+    }
+
+    /// Reports the state of training.
+    pub(super) fn report_progress(&mut self, seconds: f64, progress: Progress, psnr: Option<f64>) {
+        let primitive = self.kind.entry().primitive;
+        self.observer.on_event(&SessionEvent::Progress(&SessionProgress { primitive, seconds, progress, psnr }));
+    }
+
+    /// Reports a completed evaluation that was due at `seconds`.
+    pub(super) fn report_evaluation(&mut self, seconds: f64, images: &[ImageScores], progress: Progress) {
+        let eval = Evaluation {
+            event: "eval",
+            method: self.kind.name(),
+            seconds,
+            step: progress.step,
+            scores: Scores::mean(images),
+            n_images: images.len(),
+            primitives: progress.primitives,
+            bytes: progress.bytes,
+            step_millis: (progress.step > 0).then_some(progress.step_millis),
+            primitive: self.kind.entry().primitive,
+        };
+        self.observer.on_event(&SessionEvent::Evaluated(&eval));
+        self.evaluations.push(eval);
+    }
+
+    /// The evaluations reported so far.
+    pub(super) fn evaluations(&self) -> &[Evaluation] {
+        &self.evaluations
+    }
+
+    /// Takes the evaluations reported so far.
+    pub(super) fn take_evaluations(&mut self) -> Vec<Evaluation> {
+        std::mem::take(&mut self.evaluations)
+    }
+
+    /// Reports that training ended.
+    pub(super) fn report_training_ended(&mut self) {
+        self.observer.on_event(&SessionEvent::TrainingEnded);
+    }
+
+    /// Renders test images for the report. `scores` belong to the test images, in the same order.
+    pub(super) fn compare<'a>(
+        &self,
+        method: &mut dyn Method,
+        tests: impl Iterator<Item = &'a Arc<Keyframe>>,
+        scores: &[ImageScores],
+    ) -> crate::Result<Vec<report::Comparison>> {
+        let scored = tests.zip(scores).map(|(keyframe, scores)| report::Scored {
+            keyframe,
+            name: self.image_name(scores),
+            psnr: scores.psnr,
+            ssim: scores.ssim,
+        });
+        report::compare(method, &scored.collect::<Vec<_>>())
+    }
+
+    /// GPU time of each kernel in a step in milliseconds, if profiling was requested.
+    pub(super) fn profile(&self, method: &mut dyn Method) -> crate::Result<Option<Vec<(&'static str, f64)>>> {
+        self.profiles.then(|| profile(method)).transpose()
+    }
+
+    /// Writes the report of a saved model, and reports the end.
+    pub(super) fn report_end(&mut self, model: ScoredModel<'_, impl Serialize>) -> crate::Result<()> {
+        let ScoredModel { out, outcome, .. } = model;
+        let done = DoneEvent {
+            event: "done",
+            method: self.kind.name(),
+            seconds: outcome.seconds,
+            steps: outcome.steps,
+            scores: outcome.scores.clone(),
+            primitives: outcome.primitives,
+            bytes: outcome.bytes,
+            out,
+            checkpoint_sha256: model.checkpoint_sha256,
+        };
+        let report = Report {
+            done: &done,
+            adapter: model.adapter,
+            details: model.details,
+            trials: model.trials,
+            passes: model.passes.unwrap_or_default(),
+            evaluations: &outcome.evaluations,
+            per_image: self.named(&outcome.per_image),
+        };
+        let written = run_folder::write_json(&out.join("report.json"), &report);
+        let page = model.comparisons.and_then(|comparisons| self.write_page(out, &report, &comparisons));
+        if let Err(error) = &page {
+            log::warn!("{} was not written: {error:#}", report::FILE);
+        }
+        let passes = &report.passes;
+        let profile = self.profiles.then(|| ProfileEvent { event: "profile", method: self.kind.name(), passes });
+        let primitive = self.kind.entry().primitive;
+        let finished = FinishedReport { done: &done, profile, primitive, has_page: page.is_ok() };
+        self.observer.on_event(&SessionEvent::Finished(&finished));
+        written.with_context(|| format!("the model was saved in {}, but its report was not", out.display()))
+    }
+
+    /// Writes the HTML page of the report.
+    fn write_page(
+        &self,
+        out: &Path,
+        report: &Report<'_, impl Serialize>,
+        comparisons: &[report::Comparison],
+    ) -> crate::Result<()> {
+        let n_tests = report.per_image.len();
+        let model = SavedModel { kind: self.kind, folder: out, data: &self.data, n_tests };
+        let page = report::Page {
+            folder: out,
+            report: &serde_json::to_value(report)?,
+            primitive: self.kind.entry().primitive,
+            comparisons,
+            next: &next_commands::for_models(&[model]),
+            settings: report::settings_in(out),
+            command: next_commands::this_command(),
+        };
+        page.write()
+    }
+
+    fn named<'a>(&self, images: &'a [ImageScores]) -> Vec<NamedScores<'a>> {
+        images.iter().map(|scores| NamedScores { name: self.image_name(scores), scores }).collect()
+    }
+
+    fn image_name(&self, scores: &ImageScores) -> String {
+        self.data.image_name(&scores.camera, scores.stamp_nanos)
+    }
+}

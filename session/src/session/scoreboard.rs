@@ -1,0 +1,163 @@
+//! The scores of a session: its test keyframes, when and how they are scored, and the PSNR so far.
+
+use crate::evaluate::{Evaluator, ImageScores};
+use crate::evaluation_schedule::EvaluationSchedule;
+use crate::pending_evaluation::PendingEvaluation;
+use keyframe::{Keyframe, Split};
+use kinematics::Stamp;
+use std::collections::{BTreeMap, VecDeque};
+use std::sync::Arc;
+use trainer::Method;
+
+/// Maximum number of points of the PSNR curve. When it is reached, every other point is removed.
+const MAX_HISTORY: usize = 512;
+
+/// How a session is evaluated.
+#[derive(Clone)]
+pub struct Evaluators {
+    /// Evaluator for scheduled evaluations: thorough in `train`, quick in a live run.
+    pub during_training: Evaluator,
+    /// Maximum number of test keyframes in a scheduled evaluation, spread evenly over all. All are scored at the end.
+    pub max_images_during_training: usize,
+    /// Evaluator for the end of training.
+    pub at_end: Evaluator,
+}
+
+/// Test keyframes and their scores.
+pub(super) struct Scoreboard {
+    evaluators: Evaluators,
+    /// The one whose score is oldest comes first.
+    tests: VecDeque<Arc<Keyframe>>,
+    schedule: EvaluationSchedule,
+    /// An evaluation that is due or in progress.
+    pending: Option<PendingEvaluation>,
+    /// Whether the caller scores an evaluation image by image.
+    is_stepwise: bool,
+    /// Latest PSNR of each test keyframe, by camera and stamp.
+    newest_psnr: BTreeMap<(String, i64), f64>,
+    history: Vec<(f64, f64)>,
+}
+
+impl Scoreboard {
+    /// A scoreboard without test keyframes.
+    pub(super) fn new(evaluators: Evaluators) -> Self {
+        Self {
+            evaluators,
+            tests: VecDeque::new(),
+            schedule: EvaluationSchedule::default(),
+            pending: None,
+            is_stepwise: false,
+            newest_psnr: BTreeMap::new(),
+            history: Vec::new(),
+        }
+    }
+
+    /// Leaves it to the caller to score an evaluation image by image.
+    pub(super) fn set_stepwise(&mut self) {
+        self.is_stepwise = true;
+    }
+
+    /// Whether the caller scores an evaluation image by image.
+    pub(super) fn is_stepwise(&self) -> bool {
+        self.is_stepwise
+    }
+
+    /// Skips the evaluations of earlier training.
+    pub(super) fn skip_until(&mut self, previous_secs: f64) {
+        self.schedule.reached(previous_secs);
+    }
+
+    /// Keeps a test keyframe for evaluation; ignores other keyframes.
+    pub(super) fn hold(&mut self, keyframe: &Arc<Keyframe>) {
+        if keyframe.split != Split::Test {
+            return;
+        }
+        if keyframe.rgba_srgb.chunks_exact(4).any(|pixel| pixel[3] > 0) {
+            self.tests.push_back(keyframe.clone());
+        } else {
+            let Keyframe { camera, stamp, .. } = &**keyframe;
+            log::warn!("the test image of {camera} at {} ns is not scored: all of its pixels are masked", stamp.0);
+        }
+    }
+
+    /// Removes a keyframe and its score.
+    pub(super) fn remove(&mut self, camera: &str, stamp: Stamp) {
+        self.tests.retain(|held| held.camera.as_ref() != camera || held.stamp != stamp);
+        self.newest_psnr.retain(|(of, nanos), _| of != camera || *nanos != stamp.0);
+    }
+
+    /// The test keyframes, in the order of [`Self::score_all`].
+    pub(super) fn tests(&self) -> impl ExactSizeIterator<Item = &Arc<Keyframe>> {
+        self.tests.iter()
+    }
+
+    /// Whether an evaluation should begin at this training time.
+    pub(super) fn is_due(&mut self, secs: f64) -> bool {
+        self.pending.is_none() && self.schedule.reached(secs)
+    }
+
+    /// Begins an evaluation at this training time.
+    pub(super) fn begin(&mut self, secs: f64) {
+        let max_images = self.evaluators.max_images_during_training;
+        self.pending = Some(PendingEvaluation::new(secs, self.tests.iter(), max_images));
+    }
+
+    /// Whether an evaluation is in progress.
+    pub(super) fn is_scoring(&self) -> bool {
+        self.pending.is_some()
+    }
+
+    /// Takes the evaluation in progress; it is aborted unless it is returned to [`Self::continue_with`].
+    pub(super) fn take_pending(&mut self) -> Option<PendingEvaluation> {
+        self.pending.take()
+    }
+
+    /// Continues with an evaluation that is not complete.
+    pub(super) fn continue_with(&mut self, evaluation: PendingEvaluation) {
+        self.pending = Some(evaluation);
+    }
+
+    /// Scores a test keyframe for a scheduled evaluation.
+    pub(super) fn score(&self, method: &mut dyn Method, keyframe: &Keyframe) -> crate::Result<ImageScores> {
+        self.evaluators.during_training.score_named(method, keyframe)
+    }
+
+    /// Scores all test keyframes at the end of training.
+    pub(super) fn score_all(&self, method: &mut dyn Method) -> crate::Result<Vec<ImageScores>> {
+        self.evaluators.at_end.score_all(method, self.tests.iter())
+    }
+
+    /// The test keyframe whose score is oldest, which counts as scored from now on.
+    pub(super) fn next_to_refresh(&mut self) -> Option<Arc<Keyframe>> {
+        let oldest = self.tests.pop_front()?;
+        self.tests.push_back(oldest.clone());
+        Some(oldest)
+    }
+
+    /// Records the scores of images at this training time.
+    pub(super) fn record(&mut self, images: &[ImageScores], secs: f64) {
+        for image in images {
+            self.newest_psnr.insert((image.camera.clone(), image.stamp_nanos), image.psnr);
+        }
+        let Some(psnr) = self.psnr() else { return };
+        self.history.push((secs, psnr));
+        if self.history.len() > MAX_HISTORY {
+            let mut keep = false;
+            self.history.retain(|_| {
+                keep = !keep;
+                keep
+            });
+        }
+    }
+
+    /// Mean of the latest PSNR of all test keyframes, dB.
+    pub(super) fn psnr(&self) -> Option<f64> {
+        let n = self.newest_psnr.len();
+        (n > 0).then(|| self.newest_psnr.values().sum::<f64>() / n as f64)
+    }
+
+    /// The history of [`Self::psnr`]: training seconds and dB.
+    pub(super) fn psnr_history(&self) -> &[(f64, f64)] {
+        &self.history
+    }
+}

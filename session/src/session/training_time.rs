@@ -1,0 +1,115 @@
+//! The time of a session: its clock, when to stop training, and the time that it has used a shared device.
+
+use crate::clock::Clock;
+use std::time::{Duration, Instant};
+
+/// When to stop training.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Limits {
+    /// Seconds on the session's clock.
+    pub seconds: Option<f64>,
+    /// Number of optimizer updates.
+    pub steps: Option<u64>,
+}
+
+impl Limits {
+    /// The limits as text, such as `8 s` or `500 steps`.
+    pub fn describe(self) -> String {
+        let parts =
+            [self.seconds.map(|seconds| format!("{seconds} s")), self.steps.map(|steps| format!("{steps} steps"))];
+        parts.into_iter().flatten().collect::<Vec<_>>().join(" or ")
+    }
+}
+
+/// Training time, its limits, and device time.
+pub(super) struct TrainingTime {
+    limits: Limits,
+    clock: Clock,
+    /// Time that this session has used a shared device.
+    device_time: Duration,
+    /// Training time at which this session was finished while others continued, seconds.
+    finished_secs: Option<f64>,
+}
+
+impl TrainingTime {
+    /// The time of a new session. Its clock does not run until [`Self::start`].
+    pub(super) fn new(limits: Limits) -> Self {
+        Self { limits, clock: Clock::default(), device_time: Duration::ZERO, finished_secs: None }
+    }
+
+    /// Replaces the clock.
+    pub(super) fn set_clock(&mut self, clock: Clock) {
+        self.clock = clock;
+    }
+
+    /// Starts the clock unless it is already running.
+    pub(super) fn start(&self, at: Instant) {
+        self.clock.start(at);
+    }
+
+    /// Time at which the clock was started, if it was.
+    pub(super) fn started(&self) -> Option<Instant> {
+        self.clock.started()
+    }
+
+    /// Training time so far, seconds.
+    pub(super) fn secs(&self) -> f64 {
+        self.clock.secs()
+    }
+
+    /// Excludes this much from the training time.
+    pub(super) fn exclude(&self, spent: Duration) {
+        self.clock.exclude(spent);
+    }
+
+    /// Whether a limit was reached after this many steps.
+    pub(super) fn is_over(&self, n_steps: u64) -> bool {
+        self.limits.seconds.is_some_and(|secs| self.secs() >= secs) || self.has_finished_steps(n_steps)
+    }
+
+    /// Number of steps left after this many; `None` without a step limit.
+    pub(super) fn n_steps_remaining(&self, n_steps: u64) -> Option<u64> {
+        Some(self.limits.steps?.saturating_sub(n_steps))
+    }
+
+    /// Whether the step limit was reached after this many steps.
+    pub(super) fn has_finished_steps(&self, n_steps: u64) -> bool {
+        self.n_steps_remaining(n_steps) == Some(0)
+    }
+
+    /// Time that this session has used a shared device.
+    pub(super) fn device_time(&self) -> Duration {
+        self.device_time
+    }
+
+    /// Adds time on a shared device.
+    pub(super) fn add_device_time(&mut self, spent: Duration) {
+        self.device_time += spent;
+    }
+
+    /// Raises the device time to at least this.
+    pub(super) fn raise_device_time(&mut self, device_time: Duration) {
+        self.device_time = self.device_time.max(device_time);
+    }
+
+    /// Marks the session as finished at the current training time, unless it already is.
+    pub(super) fn mark_finished(&mut self) {
+        let secs = self.secs();
+        self.finished_secs.get_or_insert(secs);
+    }
+
+    /// Whether the session was marked as finished.
+    pub(super) fn is_finished(&self) -> bool {
+        self.finished_secs.is_some()
+    }
+
+    /// Continues a session that may have been finished.
+    pub(super) fn unmark_finished(&mut self) {
+        self.finished_secs = None;
+    }
+
+    /// Training time at the end: when the session was finished, or now. Seconds.
+    pub(super) fn end_secs(&self) -> f64 {
+        self.finished_secs.unwrap_or_else(|| self.secs())
+    }
+}

@@ -1,0 +1,177 @@
+//! `fieldrig bench live`: plays a recording in real time into runs with viewers, and measures latency and accuracy.
+
+use super::run_flags;
+use super::runs_args::print_result;
+use crate::commands::run;
+use crate::exit::Exit;
+use crate::print;
+use anyhow::Context;
+use bench::live::{Conditions, HandEyeError, LiveRun, findings};
+use bench::{BenchResult, Viewer, ViewerOptions};
+use capture::{Rig, open};
+use session::run_folder::CreatedFolders;
+use std::ffi::OsString;
+use std::path::{Path, PathBuf};
+
+/// Flags of `bench live`.
+#[derive(Debug, clap::Args)]
+pub(crate) struct Args {
+    /// Recording of `fieldrig record` or `fieldrig run --record`
+    recording: PathBuf,
+    /// Rig file [default: the one stored in the recording]
+    #[arg(long, value_name = "FILE")]
+    rig: Option<PathBuf>,
+    /// Length of each run in seconds, counted from the first image; training continues after the end of the recording
+    #[arg(long, value_name = "S", default_value_t = 60.0, value_parser = super::super::number_in_range(1.0..=1e6))]
+    seconds: f64,
+    /// Numbers of viewers that request pictures back to back, one run each
+    #[arg(long, value_name = "N,...", value_delimiter = ',', default_value = "0,1,8", value_parser = clap::value_parser!(u64).range(0..=32))]
+    viewers: Vec<u64>,
+    /// Width and height of the pictures, pixels
+    #[arg(long, value_name = "WxH", default_value = "1024x1024", value_parser = size)]
+    size: [u32; 2],
+    /// Request panoramas (equirectangular) instead of pinhole views
+    #[arg(long)]
+    panorama: bool,
+    /// Repeat the run with one viewer and a wrong hand-eye calibration: degrees and millimeters in random directions
+    #[arg(long, value_name = "DEG,MM", value_parser = hand_eye_error)]
+    hand_eye_error: Option<(f64, f64)>,
+    /// Number of directions of the hand-eye error, one run each
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..=100))]
+    directions: u64,
+    /// Folder for charts and numbers
+    #[arg(long, value_name = "DIR", default_value = "bench-live")]
+    out: PathBuf,
+    /// Print JSON, one object per run
+    #[arg(long)]
+    json: bool,
+    /// More flags for `fieldrig run`
+    #[arg(last = true, value_name = "RUN FLAGS")]
+    run_flags: Vec<OsString>,
+}
+
+fn size(text: &str) -> Result<[u32; 2], String> {
+    let parsed = text.split_once('x').and_then(|(width, height)| Some([width.parse().ok()?, height.parse().ok()?]));
+    parsed
+        .filter(|size: &[u32; 2]| size.iter().all(|n| (1..=4096).contains(n)))
+        .ok_or_else(|| "must be a width and a height from 1 to 4096, such as 1024x1024".to_owned())
+}
+
+fn hand_eye_error(text: &str) -> Result<(f64, f64), String> {
+    let parsed = text.split_once(',').and_then(|(deg, mm)| Some((deg.trim().parse().ok()?, mm.trim().parse().ok()?)));
+    parsed
+        .filter(|(deg, mm)| (0.0..=90.0).contains(deg) && (0.0..=1000.0).contains(mm))
+        .ok_or_else(|| "must be degrees up to 90 and millimeters up to 1000, such as 1,5".to_owned())
+}
+
+pub(super) fn run(args: &Args) -> anyhow::Result<Exit> {
+    std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
+    let rig = args.rig.as_ref().map(|path| Rig::load(path, &[])).transpose()?;
+    let rig = open::recording(&args.recording, rig, &[])?.rig;
+    let mut runs = Vec::new();
+    for conditions in args.conditions() {
+        let run = args.measure(&rig, conditions)?;
+        if args.json {
+            print::report_json(&serde_json::json!({ "event": "run", "run": run }))?;
+        } else {
+            print::report(describe(&run));
+        }
+        runs.push(run);
+    }
+    let [width, height] = args.size;
+    let kind = if args.panorama { "panoramas" } else { "pictures" };
+    let input = format!("{}, {kind} of {width}x{height}, {} s", args.recording.display(), args.seconds);
+    let findings = findings(&input, &runs);
+    let page = findings.write(&args.out)?;
+    print_result(&BenchResult { findings, page, data_losses: Vec::new() }, args.json)?;
+    Ok(Exit::Done)
+}
+
+fn describe(run: &LiveRun) -> String {
+    let picture = run.latency("request to complete picture");
+    let picture =
+        picture.map_or(String::new(), |latency| format!("  picture {:.1} ms (99 %: {:.1})", latency.p50, latency.p99));
+    let psnr = run.psnr.last().map_or(String::new(), |(seconds, psnr)| format!("  {psnr:.2} dB at {seconds:.0} s"));
+    format!("{}: {:.1} steps per second{picture}{psnr}", run.conditions, run.steps_per_sec)
+}
+
+impl Args {
+    fn conditions(&self) -> Vec<Conditions> {
+        let right = self.viewers.iter().map(|&n_viewers| Conditions { n_viewers, hand_eye_error: None });
+        let wrong = self.hand_eye_error.into_iter().flat_map(|(degrees, millimeters)| {
+            let error = move |seed| HandEyeError { degrees, millimeters, seed };
+            (1..=self.directions).map(move |seed| Conditions { n_viewers: 1, hand_eye_error: Some(error(seed)) })
+        });
+        right.chain(wrong).collect()
+    }
+
+    /// One run, whose folder is removed at its end.
+    fn measure(&self, rig: &Rig, conditions: Conditions) -> anyhow::Result<LiveRun> {
+        let folder = self.out.join(format!("run-{}", std::process::id()));
+        std::fs::create_dir_all(&folder).with_context(|| format!("cannot create {}", folder.display()))?;
+        let measured = self.measure_in(&folder, rig, conditions);
+        if let Err(error) = std::fs::remove_dir_all(&folder) {
+            log::warn!("cannot remove {}: {error}", folder.display());
+        }
+        measured
+    }
+
+    fn measure_in(&self, folder: &Path, rig: &Rig, conditions: Conditions) -> anyhow::Result<LiveRun> {
+        let mut rig = rig.clone();
+        if let Some(error) = conditions.hand_eye_error {
+            error.apply(&mut rig);
+        }
+        rig.write_resolved(folder).with_context(|| format!("cannot write into {}", folder.display()))?;
+        let flags = vec!["--from".into(), self.recording.clone().into(), "--real-time".into()];
+        let (rig_file, out) = (folder.join(drivers::recording::RIG_FILE), folder.join("out"));
+        let flags = run_flags::parse(&rig_file, self.seconds, (&out, self.json), flags, &self.run_flags)?;
+        let mut running = run::start(&flags, None, &mut CreatedFolders::default())?;
+        let address = running.server.address();
+        let options = ViewerOptions { size_px: self.size, is_panorama: self.panorama };
+        let viewers: Vec<Viewer> =
+            (0..conditions.n_viewers).map(|_| Viewer::connect(address, options)).collect::<bench::Result<_>>()?;
+        while running.run_time_slice()? {}
+        let measured = LiveRun::of(conditions, &running.live, &viewers);
+        drop(viewers);
+        match running.discard()? {
+            Some(error) => Err(anyhow::Error::new(error).context("the recording cannot be read")),
+            None => Ok(measured),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use clap::Parser;
+
+    #[derive(Debug, Parser)]
+    struct Flags {
+        #[command(flatten)]
+        args: Args,
+    }
+
+    #[test]
+    fn each_number_of_viewers_and_each_direction_is_a_run() {
+        let line = [
+            "live",
+            "scan.mcap",
+            "--viewers",
+            "0,4",
+            "--hand-eye-error",
+            "1,5",
+            "--directions",
+            "2",
+            "--size",
+            "640x480",
+        ];
+        let args = Flags::parse_from(line).args;
+        let conditions: Vec<String> = args.conditions().iter().map(Conditions::to_string).collect();
+        assert_eq!(conditions[..2], ["0 viewers", "4 viewers"]);
+        assert_eq!(conditions[3], "1 viewer, hand-eye off by 1 degrees, 5 mm (seed 2)");
+        assert_eq!((conditions.len(), args.size), (4, [640, 480]));
+        for invalid in [["--size", "10"], ["--size", "0x5"], ["--hand-eye-error", "1"], ["--hand-eye-error", "100,1"]] {
+            assert!(Flags::try_parse_from(["live", "scan.mcap"].iter().chain(&invalid)).is_err(), "{invalid:?}");
+        }
+    }
+}

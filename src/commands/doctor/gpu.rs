@@ -1,0 +1,44 @@
+//! The GPU.
+
+use crate::open_gpu::open_gpu;
+use capture::doctor::Finding;
+use trainer::gpu::Gpu;
+
+/// Opens the GPU and describes it.
+pub(super) fn gpu() -> Vec<Finding> {
+    let gpu = match open_gpu() {
+        Ok(gpu) => gpu,
+        Err(error) => {
+            let adapters = Gpu::adapters();
+            let remedy = if adapters.is_empty() {
+                "sudo apt-get install -y libvulkan1 mesa-vulkan-drivers   (a software adapter; a GPU needs its own driver)"
+                    .to_owned()
+            } else {
+                format!("unset FIELDRIG_GPU, or set it to one of: {}", numbered(&adapters))
+            };
+            return vec![Finding::fail("gpu", error.to_string(), remedy)];
+        }
+    };
+    let adapter = if gpu.is_software() {
+        let remedy = "training is slow on a software adapter: install the Vulkan driver of the GPU, if there is one";
+        Finding::warn("gpu", gpu.describe(), remedy)
+    } else {
+        Finding::ok("gpu", gpu.describe())
+    };
+    let optional = gpu.optional();
+    let lanes = optional.subgroup_lanes.map_or("none".to_owned(), |lanes| lanes.to_string());
+    let timestamps = if optional.timestamps { "yes" } else { "no: times per pass are unavailable" };
+    let mib = gpu.max_binding_bytes() >> 20;
+    let message = format!("largest buffer {mib} MiB, subgroup lanes {lanes}, timestamps {timestamps}");
+    let mut findings = vec![adapter, Finding::ok("gpu limits", message)];
+    let adapters = Gpu::adapters();
+    if adapters.len() > 1 {
+        findings.push(Finding::ok("gpus", format!("{}; FIELDRIG_GPU=N selects one", numbered(&adapters))));
+    }
+    findings
+}
+
+fn numbered(names: &[String]) -> String {
+    let names: Vec<_> = names.iter().enumerate().map(|(ix, name)| format!("{ix}: {name}")).collect();
+    names.join(", ")
+}

@@ -1,0 +1,72 @@
+//! The schedule of training: when the splat count changes, and how far training has come.
+
+/// Steps between changes of the splat count; the next constant is the step of the first change.
+pub(crate) const GROWTH_PERIOD: u64 = 100;
+const GROWTH_START: u64 = 200;
+/// Fraction of the planned steps after which the splat count stays constant.
+const GROWTH_END_FRAC: f64 = 0.75;
+/// Steps between increases of the active degree of spherical harmonics.
+const SH_PERIOD: u64 = 300;
+/// Highest degree of spherical harmonics.
+const MAX_SH_DEGREE: u64 = 3;
+
+/// Position of training in its schedule.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Schedule {
+    /// Optimizer updates so far.
+    pub(super) step: u64,
+    /// Step at which the planned steps begin; late keyframes move it forward.
+    pub(super) start: u64,
+    pub(super) last_growth_step: u64,
+    pub(super) n_planned_steps: u64,
+}
+
+impl Schedule {
+    /// The start of training.
+    pub(super) fn new(n_planned_steps: u64) -> Self {
+        Self { step: 0, start: 0, last_growth_step: 0, n_planned_steps }
+    }
+
+    /// Moves the planned steps forward for a keyframe that arrives now: at least half of them remain, so that learning
+    /// rates are large enough for it and growth continues.
+    pub(super) fn extend_for_arrival(&mut self) {
+        self.start = self.start.max(self.step.saturating_sub(self.n_planned_steps / 2));
+    }
+
+    /// Step at which growth ends.
+    fn growth_end(&self) -> u64 {
+        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a fraction of a u64")]
+        let n_growth_steps = (GROWTH_END_FRAC * self.n_planned_steps as f64) as u64;
+        (self.start + n_growth_steps).next_multiple_of(GROWTH_PERIOD) // Submits end at these steps.
+    }
+
+    /// Whether growth has ended.
+    pub(super) fn is_mature(&self) -> bool {
+        self.step >= self.growth_end()
+    }
+
+    /// Whether the splat count changes at the current step.
+    pub(super) fn is_growth_due(&self) -> bool {
+        self.step >= GROWTH_START
+            && !self.is_mature()
+            && self.step.is_multiple_of(GROWTH_PERIOD)
+            && self.last_growth_step != self.step
+    }
+
+    /// Steps until the splat count or the active degree may change.
+    pub(super) fn steps_to_next_change(&self) -> u64 {
+        GROWTH_PERIOD - self.step % GROWTH_PERIOD
+    }
+
+    /// Degree of spherical harmonics to train, if there is memory for it.
+    pub(super) fn active_degree(&self) -> u32 {
+        u32::try_from((self.step / SH_PERIOD).min(MAX_SH_DEGREE)).expect("at most 3")
+    }
+
+    /// Completed fraction of the planned steps at the last possible change: the first step of a submit depends on
+    /// timing, and values that are set once per submit must not depend on it.
+    pub(super) fn completed_frac(&self) -> f64 {
+        let step = self.step - self.step % GROWTH_PERIOD;
+        step.saturating_sub(self.start) as f64 / self.n_planned_steps.max(1) as f64
+    }
+}

@@ -1,0 +1,64 @@
+//! The training pipelines, compiled on another thread or on demand, because that takes seconds.
+
+use crate::Error;
+use crate::gpu::Gpu;
+use crate::splat::kernels::TrainPipelines;
+use std::sync::Arc;
+use std::thread::JoinHandle;
+
+/// The training pipelines, once they are compiled.
+#[derive(Debug)]
+pub(super) enum LazyPipelines {
+    /// Compiled when they are needed.
+    OnDemand,
+    Compiling(Compiling),
+    Ready(Arc<TrainPipelines>),
+    Failed,
+}
+
+/// Pipelines being compiled on a thread. Dropping it waits for the thread, because NVIDIA's driver corrupts the heap
+/// if a process exits while the driver compiles.
+#[derive(Debug)]
+pub(super) struct Compiling(Option<JoinHandle<Result<TrainPipelines, Error>>>);
+
+impl Compiling {
+    fn finish(&mut self) -> Result<TrainPipelines, Error> {
+        self.0.take().and_then(|thread| thread.join().ok()).unwrap_or(Err(Error::DeviceLost))
+    }
+}
+
+impl Drop for Compiling {
+    fn drop(&mut self) {
+        let _ = self.finish();
+    }
+}
+
+impl LazyPipelines {
+    /// Starts compiling on another thread.
+    pub(super) fn start(gpu: &Arc<Gpu>) -> Self {
+        let gpu = gpu.clone();
+        Self::Compiling(Compiling(Some(std::thread::spawn(move || TrainPipelines::new(&gpu)))))
+    }
+
+    /// Waits for the pipelines.
+    pub(super) fn wait(&mut self, gpu: &Gpu) -> Result<Arc<TrainPipelines>, Error> {
+        if let Self::Ready(ready) = self {
+            return Ok(ready.clone());
+        }
+        let ready = Arc::new(match std::mem::replace(self, Self::Failed) {
+            Self::Compiling(mut thread) => thread.finish()?,
+            Self::OnDemand => TrainPipelines::new(gpu)?,
+            Self::Ready(_) | Self::Failed => return Err(Error::DeviceLost),
+        });
+        *self = Self::Ready(ready.clone());
+        Ok(ready)
+    }
+
+    /// The pipelines, unless they must be waited for.
+    pub(super) fn ready(&self) -> Option<Arc<TrainPipelines>> {
+        match self {
+            Self::Ready(ready) => Some(ready.clone()),
+            Self::OnDemand | Self::Compiling(_) | Self::Failed => None,
+        }
+    }
+}

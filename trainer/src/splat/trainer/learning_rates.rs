@@ -1,0 +1,60 @@
+//! Learning rates and costs of the splats' parameters.
+
+use crate::gpu::f32_of;
+use crate::model_options::ModelOptions;
+use crate::splat::options::SplatOptions;
+use crate::splat::params::Rule;
+use crate::splat::schedule::Schedule;
+use crate::splat::snapshot::ObservedScene;
+
+/// Learning rate of the means, in scene sizes, and the fraction of it at the end of the planned steps.
+const MEAN_RATE: f32 = 1.6e-4;
+const FINAL_MEAN_RATE_FRAC: f32 = 0.01;
+const LOG_SCALE_RATE: f32 = 5e-3;
+const ROTATION_RATE: f32 = 1e-3;
+const OPACITY_RATE: f32 = 5e-2;
+/// Learning rate of the constant color; the others are slower by the next factor.
+const SH_DC_RATE: f32 = 2.5e-3;
+const SH_REST_DIVISOR: f32 = 20.0;
+/// Decay of Adam's moments, and the number added to its denominator.
+const BETAS: [f32; 2] = [0.9, 0.999];
+const EPSILON: f32 = 1e-15;
+/// Range of the splats' standard deviations, in scene sizes.
+const SCALE_RANGE: [f32; 2] = [1e-5, 2.0];
+/// Maximum costs of opacity and size relative to the color loss.
+const MAX_COST: f64 = 0.1;
+
+/// The rule for the next steps on `n_views` images with `n_splats` splats.
+pub(super) fn rule(
+    options: &ModelOptions<SplatOptions>,
+    schedule: &Schedule,
+    scene: &ObservedScene,
+    n_views: usize,
+    n_splats: u32,
+) -> Rule {
+    let size = f32_of(scene.size_m);
+    let cost = (options.specific.cost_images / n_views.max(1) as f64).powi(2).min(MAX_COST);
+    let cost = f32_of(cost / f64::from(n_splats.max(1)));
+    #[expect(clippy::cast_possible_truncation, reason = "both halves of the seed are used")]
+    let seed = (options.common.seed ^ (options.common.seed >> 32)) as u32;
+    Rule {
+        mean_rate_m: MEAN_RATE * size,
+        log_scale_rate: LOG_SCALE_RATE,
+        rotation_rate: ROTATION_RATE,
+        opacity_rate: OPACITY_RATE,
+        sh_dc_rate: SH_DC_RATE,
+        sh_rest_rate: SH_DC_RATE / SH_REST_DIVISOR,
+        noise: f32_of(options.specific.noise),
+        final_mean_rate_frac: FINAL_MEAN_RATE_FRAC,
+        betas: BETAS,
+        epsilon: EPSILON,
+        n_planned_steps: f32_of(schedule.n_planned_steps as f64),
+        schedule_start: f32_of(schedule.start as f64),
+        opacity_cost: cost,
+        scale_cost: cost,
+        log_scale_range: SCALE_RANGE.map(|scale| (scale * size).ln()),
+        seed,
+        update_all: u32::from(!scene.has_depth),
+        unused: 0,
+    }
+}

@@ -1,0 +1,153 @@
+//! Everything that training optimizes, and the growth of the splat count up to a limit.
+
+use super::recorder::Recorder;
+use super::renderer::Renderer;
+use crate::Error;
+use crate::gpu::Gpu;
+use crate::model_options::ModelOptions;
+use crate::splat::arrays::SplatArrays;
+use crate::splat::buffers::{SplatBuffers, n_sh_rest};
+use crate::splat::camera_params::CameraParams;
+use crate::splat::kernels::TrainPipelines;
+use crate::splat::options::SplatOptions;
+use crate::splat::params::Growth;
+use crate::splat::passes::{self, GrowthBuffers};
+
+/// Standard deviation of a child's position within its parent, in standard deviations of the parent.
+const CHILD_SPREAD: f32 = 0.5;
+/// Splats with a lower opacity are replaced.
+const MIN_OPACITY: f32 = 0.005;
+
+/// Splats and camera parameters in training.
+#[derive(Debug)]
+pub(super) struct TrainedModel {
+    pub(super) splats: SplatBuffers,
+    pub(super) cameras: CameraParams,
+    max_splats: u32,
+    /// Whether the GPU has no memory left for more splats.
+    is_full: bool,
+}
+
+impl TrainedModel {
+    /// A model without splats.
+    pub(super) fn new(gpu: &Gpu, options: &ModelOptions<SplatOptions>) -> Result<Self, Error> {
+        Ok(Self {
+            splats: SplatBuffers::new(gpu, 1, options.specific.sh_degree)?,
+            cameras: CameraParams::new(gpu, options.common.cameras.always())?,
+            max_splats: options.cap(),
+            is_full: false,
+        })
+    }
+
+    /// Adds splats, up to the limit.
+    pub(super) fn add(
+        &mut self,
+        recorder: &mut Recorder,
+        renderer: &mut Renderer,
+        arrays: &SplatArrays,
+    ) -> Result<(), Error> {
+        let n_before = self.splats.n_splats;
+        let n_allowed = self.max_splats.saturating_sub(n_before) as usize;
+        let n_after = n_before + n_splats_u32(arrays.n_splats().min(n_allowed));
+        if n_after == n_before {
+            return Ok(());
+        }
+        let n_new = (self.reserve_up_to(recorder, renderer, n_after)? - n_before) as usize;
+        if n_new == 0 {
+            return Ok(());
+        }
+        let kept = if n_new == arrays.n_splats() { arrays.clone() } else { spread_out(arrays, n_new) };
+        self.splats.append(&recorder.gpu, &kept);
+        Ok(())
+    }
+
+    /// Replaces dead splats by children of other splats, and adds children up to the limit: a fraction `growth_frac`
+    /// of the splats. `key` seeds the random choices.
+    pub(super) fn grow(
+        &mut self,
+        recorder: &mut Recorder,
+        renderer: &mut Renderer,
+        learn: &TrainPipelines,
+        growth_frac: f64,
+        key: u32,
+    ) -> Result<(), Error> {
+        let n_before = self.splats.n_splats;
+        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "saturates, then limited")]
+        let n_more = if self.is_full { 0 } else { (f64::from(n_before) * growth_frac).ceil() as u32 };
+        let n_after = (n_before + n_more).min(self.max_splats).max(n_before);
+        let n_after = self.reserve_up_to(recorder, renderer, n_after)?.max(n_before);
+        let growth = Growth {
+            n_before,
+            n_after,
+            key,
+            capacity: self.splats.capacity,
+            n_sh_rest: n_sh_rest(self.splats.sh_degree),
+            child_spread: CHILD_SPREAD,
+            min_opacity: MIN_OPACITY,
+            unused: 0.0,
+        };
+        let buffers = match GrowthBuffers::new(&recorder.gpu, &growth) {
+            Err(error) if error.is_out_of_memory() => {
+                self.stop_growing(&error);
+                return Ok(());
+            }
+            buffers => buffers?,
+        };
+        passes::grow(&recorder.gpu, &mut recorder.passes, learn, &self.splats, &buffers, &growth);
+        recorder.submit_and_release_buffers();
+        self.splats.set_n_splats(&recorder.gpu, n_after);
+        Ok(())
+    }
+
+    /// Ensures capacity for `n_splats`. If the GPU has no memory for them, returns the smaller number that fits.
+    fn reserve_up_to(&mut self, recorder: &mut Recorder, renderer: &mut Renderer, n_splats: u32) -> Result<u32, Error> {
+        if self.is_full {
+            return Ok(n_splats.min(self.splats.capacity));
+        }
+        match self.reserve(recorder, renderer, n_splats) {
+            Ok(()) => Ok(n_splats),
+            Err(error) if error.is_out_of_memory() && self.splats.n_splats > 0 => {
+                self.stop_growing(&error);
+                Ok(n_splats.min(self.splats.capacity))
+            }
+            Err(error) => Err(error),
+        }
+    }
+
+    fn reserve(&mut self, recorder: &mut Recorder, renderer: &mut Renderer, n_splats: u32) -> Result<(), Error> {
+        let have = self.splats.capacity;
+        if n_splats <= have {
+            return Ok(());
+        }
+        let capacity = n_splats.max(have.saturating_mul(3) / 2).min(self.max_splats.max(n_splats));
+        // Before the model itself, because every model that fits must also be drawable.
+        renderer.reserve_splats(recorder, capacity)?;
+        self.splats = self.splats.resized(&recorder.gpu, capacity, self.splats.sh_degree)?;
+        recorder.passes.clear_bindings();
+        Ok(())
+    }
+
+    fn stop_growing(&mut self, error: &Error) {
+        if !std::mem::replace(&mut self.is_full, true) {
+            log::warn!("the model stops growing at {} splats: {error}", self.splats.n_splats);
+        }
+    }
+}
+
+/// Picks `n` of the splats, evenly over their list.
+fn spread_out(arrays: &SplatArrays, n: usize) -> SplatArrays {
+    let picks: Vec<usize> = (0..n).map(|ix| ix * arrays.n_splats() / n).collect();
+    let n_coeffs = arrays.n_coefficients();
+    SplatArrays {
+        means: picks.iter().map(|ix| arrays.means[*ix]).collect(),
+        log_scales: picks.iter().map(|ix| arrays.log_scales[*ix]).collect(),
+        rotations_wxyz: picks.iter().map(|ix| arrays.rotations_wxyz[*ix]).collect(),
+        opacity_logits: picks.iter().map(|ix| arrays.opacity_logits[*ix]).collect(),
+        sh: picks.iter().flat_map(|ix| arrays.sh[ix * n_coeffs..(ix + 1) * n_coeffs].iter().copied()).collect(),
+        sh_degree: arrays.sh_degree,
+    }
+}
+
+fn n_splats_u32(n: usize) -> u32 {
+    u32::try_from(n).expect("at most the limit, which is a u32")
+}

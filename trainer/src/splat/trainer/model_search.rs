@@ -1,0 +1,136 @@
+//! Runs the trials that decide which camera parameters are optimized and how large the model is.
+
+use super::SplatTrainer;
+use crate::Error;
+use crate::splat::params::status;
+use crate::splat::snapshot::Snapshot;
+use crate::splat::trials::{Due, SecondHalf, TrialContext, TrialEnd};
+use calibration::Candidate;
+use keyframe::Keyframe;
+use std::sync::Arc;
+
+impl SplatTrainer {
+    fn trial_context(&self) -> TrialContext {
+        TrialContext {
+            step: self.schedule.step,
+            n_splats: self.model.splats.n_splats,
+            is_mature: self.schedule.is_mature(),
+            sh_degree: self.model.splats.sh_degree,
+        }
+    }
+
+    /// Starts, advances and ends trials. All consequences of the end of a trial are applied at the same step, because
+    /// the end of the next submit depends on timing.
+    pub(super) fn try_when_due(&mut self) -> Result<(), Error> {
+        while self.trials.due(self.trial_context()) != Due::Nothing {
+            self.finish_in_flight()?; // A failed submit may reduce the step count.
+            match self.trials.due(self.trial_context()) {
+                Due::Nothing => {}
+                Due::Begin(candidate) => self.begin_trial(candidate)?,
+                Due::BeginSecondHalf => self.begin_second_half()?,
+                Due::Arrival => self.add_next_arrival()?,
+                Due::Gains => self.try_gains()?,
+                Due::End => self.decide_trial()?,
+                Due::ReleaseValidation => self.release_validation()?,
+            }
+        }
+        Ok(())
+    }
+
+    fn begin_trial(&mut self, candidate: Candidate) -> Result<(), Error> {
+        match self.snapshot() {
+            Ok(snapshot) => self.trials.begin(candidate, snapshot, self.views.len()),
+            Err(error) => self.end_trials_without_memory(error)?,
+        }
+        Ok(())
+    }
+
+    /// Restores the state at the beginning of a trial and applies the change.
+    fn begin_second_half(&mut self) -> Result<(), Error> {
+        let baseline_db = self.score_validation()?;
+        let snapshot = match self.snapshot() {
+            Ok(snapshot) => snapshot,
+            Err(error) => return self.end_trials_without_memory(error),
+        };
+        let Some(SecondHalf { from, candidate, arrived }) = self.trials.begin_second_half(snapshot, baseline_db) else {
+            return Ok(());
+        };
+        self.restore_snapshot(from)?;
+        self.views.retain(|keyframe| !arrived.iter().any(|other| Arc::ptr_eq(other, keyframe)));
+        match candidate {
+            Candidate::Cameras(params) => self.model.cameras.enable(params),
+            Candidate::Halved { to, .. } => self.keep_most_contributing(to)?,
+            Candidate::ShDegree { to, .. } => self.lower_degree(to)?,
+        }
+        self.prepare_training()
+    }
+
+    /// Adds a keyframe at the step of its arrival in the first half.
+    fn add_next_arrival(&mut self) -> Result<(), Error> {
+        let Some(keyframe) = self.trials.next_arrival() else { return Ok(()) };
+        self.add_arrival(keyframe)?;
+        self.prepare_training()
+    }
+
+    fn decide_trial(&mut self) -> Result<(), Error> {
+        let variant_db = self.score_validation()?;
+        let Some(finished) = self.trials.end(&variant_db) else { return Ok(()) };
+        self.end_trial(finished)?;
+        self.prepare_training()
+    }
+
+    /// Ends a trial: restores the state without the change if it was rejected, then adds the keyframes that arrived
+    /// meanwhile.
+    fn end_trial(&mut self, TrialEnd { restored, seeded, deferred }: TrialEnd) -> Result<(), Error> {
+        if let Some(snapshot) = restored {
+            self.restore_snapshot(snapshot)?;
+            seeded.into_iter().for_each(|keyframe| self.views.push(keyframe));
+        }
+        deferred.into_iter().try_for_each(|keyframe| self.add_arrival(keyframe))
+    }
+
+    /// Ends a trial in its second half without a decision.
+    pub(super) fn cancel_trial(&mut self) -> Result<(), Error> {
+        let Some(canceled) = self.trials.cancel() else { return Ok(()) };
+        log::info!("training stopped during a trial: saved the model without the change");
+        self.end_trial(canceled)
+    }
+
+    /// Ends all trials, which need copies of the model, if there is no memory for them. Training continues.
+    fn end_trials_without_memory(&mut self, error: Error) -> Result<(), Error> {
+        if !error.is_out_of_memory() {
+            return Err(error);
+        }
+        log::warn!("model changes are no longer tested: {error}");
+        self.release_validation()
+    }
+
+    fn release_validation(&mut self) -> Result<(), Error> {
+        let released: Vec<Arc<Keyframe>> = self.trials.finish();
+        released.into_iter().try_for_each(|keyframe| self.add_view(keyframe))?;
+        self.prepare_training()
+    }
+
+    pub(super) fn snapshot(&self) -> Result<Snapshot, Error> {
+        let (gpu, splats, cameras) = (&self.recorder.gpu, &self.model.splats, &self.model.cameras);
+        Ok(Snapshot {
+            splats: splats.resized(gpu, splats.capacity, splats.sh_degree)?,
+            cameras: (cameras.set, cameras.copy(gpu)?),
+            schedule: self.schedule,
+            scene: self.seeding.scene.clone(),
+        })
+    }
+
+    pub(super) fn restore_snapshot(&mut self, snapshot: Snapshot) -> Result<(), Error> {
+        self.recorder.passes.clear_bindings();
+        let n_reverted = self.schedule.step.wrapping_sub(snapshot.schedule.step);
+        self.trials.n_reverted_steps = self.trials.n_reverted_steps.wrapping_add(n_reverted);
+        self.model.splats = snapshot.splats;
+        self.model.cameras.restore_snapshot(&self.recorder.gpu, snapshot.cameras)?;
+        self.schedule = snapshot.schedule;
+        self.seeding.scene = snapshot.scene;
+        let step = u32::try_from(self.schedule.step).unwrap_or(u32::MAX);
+        self.optimizer.write_counter(&self.recorder.gpu, status::STEP, step);
+        Ok(())
+    }
+}

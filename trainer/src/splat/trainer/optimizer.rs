@@ -1,0 +1,182 @@
+//! Training steps: the passes of a step, its buffers and its counters.
+
+use super::lazy_pipelines::LazyPipelines;
+use super::model::TrainedModel;
+use super::recorder::Recorder;
+use super::renderer::{self, Renderer};
+use crate::Error;
+use crate::gpu::{Buffer, Gpu, Passes, PendingRead, f32_of};
+use crate::model_options::ModelOptions;
+use crate::splat::buffers::ImageBuffers;
+use crate::splat::kernels::TrainPipelines;
+use crate::splat::options::SplatOptions;
+use crate::splat::params::{Rule, Supervision, status};
+use crate::splat::passes::{Target, ViewPasses};
+use crate::splat::views::Level;
+use crate::submits::Submits;
+
+/// Readings further than this from the rendered depth are treated as outliers.
+const DEPTH_CLIP_M: f64 = 0.2;
+
+/// Updates the model to match the training images.
+#[derive(Debug)]
+pub(super) struct Optimizer {
+    pub(super) pipelines: LazyPipelines,
+    pub(super) submits: Submits,
+    pub(super) image_buffers: Option<ImageBuffers>,
+    /// Counters of the training passes.
+    pub(super) status: Buffer,
+    rule: Buffer,
+    supervision: Buffer,
+    /// Whether D-SSIM is part of the loss.
+    has_ssim: bool,
+    /// Number of gradients dropped because they were not finite.
+    pub(super) n_non_finite: u64,
+}
+
+/// What the passes of a step use besides the optimizer.
+#[derive(Clone, Copy)]
+pub(super) struct StepContext<'a> {
+    pub(super) gpu: &'a Gpu,
+    pub(super) learn: &'a TrainPipelines,
+    pub(super) renderer: &'a Renderer,
+    pub(super) model: &'a TrainedModel,
+}
+
+/// The resources of one training step.
+pub(super) struct PreparedView<'a> {
+    pub(super) view: ViewPasses<'a>,
+    level: &'a Level,
+    /// Present if camera parameters are optimized.
+    lens: Option<&'a Buffer>,
+}
+
+impl Optimizer {
+    pub(super) fn new(
+        gpu: &Gpu,
+        options: &ModelOptions<SplatOptions>,
+        pipelines: LazyPipelines,
+    ) -> Result<Self, Error> {
+        let supervision = Supervision {
+            background_srgb: [0.0; 4],
+            dssim_frac: f32_of(options.specific.dssim_frac),
+            depth_weight: f32_of(options.specific.depth_per_m),
+            depth_clip_m: f32_of(DEPTH_CLIP_M),
+            random_background: f32_of(options.specific.random_background),
+        };
+        Ok(Self {
+            pipelines,
+            submits: Submits::new(),
+            image_buffers: None,
+            status: gpu.storage_with("splat.train_status", &[0; 4 * status::LEN])?,
+            rule: gpu.uniform_with("splat.rule", &<Rule as bytemuck::Zeroable>::zeroed()),
+            supervision: gpu.uniform_with("splat.supervision", &supervision),
+            has_ssim: options.specific.dssim_frac > 0.0,
+            n_non_finite: 0,
+        })
+    }
+
+    /// Restarts at step 0.
+    pub(super) fn restart(&mut self, gpu: &Gpu) {
+        self.submits.reset_time();
+        self.write_counter(gpu, status::STEP, 0);
+    }
+
+    /// Uploads the learning rates of the next steps.
+    pub(super) fn write_rule(&self, gpu: &Gpu, rule: &Rule) {
+        gpu.write(&self.rule, 0, bytemuck::bytes_of(rule));
+    }
+
+    /// Sets the number of splats for the next passes.
+    pub(super) fn set_n_splats(&self, gpu: &Gpu, n_splats: u32) {
+        renderer::write_n_splats(gpu, &self.status, n_splats);
+    }
+
+    /// Sets the counters of the GPU.
+    pub(super) fn write_counter(&self, gpu: &Gpu, counter: usize, value: u32) {
+        gpu.write(&self.status, 4 * counter as u64, &value.to_le_bytes());
+    }
+
+    /// Clears the failure of a submit.
+    pub(super) fn clear_failure(&self, gpu: &Gpu) {
+        renderer::clear_failure(gpu, &self.status);
+    }
+
+    /// Allocates the buffers for training up to `capacity` splats on images of this size.
+    pub(super) fn reserve_view(
+        &mut self,
+        recorder: &mut Recorder,
+        renderer: &mut Renderer,
+        capacity: u32,
+        size_px: [u32; 2],
+    ) -> Result<(), Error> {
+        renderer.reserve_view(recorder, capacity, size_px, true)?;
+        renderer::reserve_image(recorder, &mut self.image_buffers, size_px, true)
+    }
+
+    /// Records the passes of one step on a view, whose buffers must be reserved.
+    pub(super) fn record_step(
+        &self,
+        context: &StepContext<'_>,
+        passes: &mut Passes,
+        view: (Option<&Buffer>, &Level),
+    ) -> Result<(), Error> {
+        let StepContext { gpu, learn, renderer, model } = *context;
+        let PreparedView { view, level, lens } = self.prepared_view(context, passes, view)?;
+        let target = Target {
+            image: &level.image,
+            depth: &level.depth,
+            supervision: &self.supervision,
+            gains: &model.cameras.gains,
+            ssim: self.has_ssim,
+        };
+        view.draw(passes, &renderer.pipelines);
+        view.compare(passes, learn, &target);
+        view.backward(passes, learn);
+        if let Some(lens) = lens {
+            view.update(passes, &learn.update_with_camera, &self.rule, true);
+            model.cameras.refine(&view, passes, learn, lens);
+        } else {
+            view.update(passes, &learn.update, &self.rule, false);
+        }
+        passes.dispatch(gpu, &learn.advance, 1, &[("status", &self.status)]);
+        Ok(())
+    }
+
+    /// A view with its current camera parameters; records the pass that computes them.
+    pub(super) fn prepared_view<'a>(
+        &'a self,
+        context: &StepContext<'a>,
+        passes: &mut Passes,
+        (lens, level): (Option<&'a Buffer>, &'a Level),
+    ) -> Result<PreparedView<'a>, Error> {
+        let StepContext { gpu, learn, renderer, model } = *context;
+        let lens = lens.filter(|_| !model.cameras.set.is_empty());
+        if let Some(lens) = lens {
+            model.cameras.correct(gpu, passes, learn, &level.view, lens);
+        }
+        let view = ViewPasses {
+            gpu,
+            splats: &model.splats,
+            scratch: renderer.scratch()?,
+            image_buffers: self.image_buffers.as_ref().ok_or(Error::DeviceLost)?,
+            status: &self.status,
+            view: if lens.is_some() { &model.cameras.corrected } else { &level.view },
+            size_px: level.size_px,
+        };
+        Ok(PreparedView { view, level, lens })
+    }
+
+    /// Submits the recorded steps; the read-back returns the counters after them.
+    pub(super) fn submit(&self, recorder: &mut Recorder) -> PendingRead {
+        recorder.passes.submit_reading(&recorder.gpu, &[(&self.status, 4 * status::LEN)])
+    }
+
+    /// Records the number of non-finite gradients; logs a warning at the first ones and at each doubling.
+    pub(super) fn log_non_finite(&mut self, n_non_finite: u64) {
+        if n_non_finite.checked_ilog2() > self.n_non_finite.checked_ilog2() {
+            log::warn!("dropped {n_non_finite} non-finite gradients of splats so far");
+        }
+        self.n_non_finite = n_non_finite;
+    }
+}

@@ -1,0 +1,83 @@
+//! Sums over the pixels of a picture and an image, computed by `score.wgsl`. Scores and gains follow from them.
+
+use crate::Error;
+use crate::gpu::{Buffer, Gpu, Passes, Pipeline};
+use crate::splat::buffers::ImageBuffers;
+
+/// Size of a workgroup's sums in `score.wgsl`, bytes.
+const GROUP_BYTES: usize = 48;
+/// Number of pixels of a workgroup.
+const GROUP_PIXELS: u32 = 256;
+
+/// Sums of products for one color.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(super) struct Products {
+    picture_picture: u64,
+    picture_image: u64,
+    image_image: u64,
+    n_visible: u64,
+}
+
+/// Records the comparison of a picture with an image; returns the number of bytes of sums that it writes.
+pub(super) fn record(
+    gpu: &Gpu,
+    passes: &mut Passes,
+    score: &Pipeline,
+    (view, image_buffers): (&Buffer, &ImageBuffers),
+    size_px: [u32; 2],
+    image: &Buffer,
+) -> usize {
+    let n_groups = (size_px[0] * size_px[1]).div_ceil(GROUP_PIXELS);
+    let buffers = [
+        ("view", view),
+        ("pixels", &image_buffers.pixels),
+        ("target_image", image),
+        ("products", &image_buffers.products),
+    ];
+    passes.dispatch(gpu, score, n_groups.into(), &buffers);
+    GROUP_BYTES * n_groups as usize
+}
+
+/// The sums over all workgroups, for red, green and blue.
+pub(super) fn sum_up(sums: &[[u32; 4]]) -> [Products; 3] {
+    let sum = |color: usize, part: usize| sums.iter().skip(color).step_by(3).map(|of| u64::from(of[part])).sum();
+    [0, 1, 2].map(|color| Products {
+        picture_picture: sum(color, 0),
+        picture_image: sum(color, 1),
+        image_image: sum(color, 2),
+        n_visible: sum(color, 3),
+    })
+}
+
+/// PSNR in dB, bit-identical to [`crate::eval::psnr`] because integer sums are exact.
+pub(super) fn psnr(products: &[Products; 3]) -> Result<f64, Error> {
+    let n: u64 = products.iter().map(|color| color.n_visible).sum();
+    if n == 0 {
+        return Err(Error::AllPixelsMasked);
+    }
+    let squares: u64 =
+        products.iter().map(|color| color.picture_picture + color.image_image - 2 * color.picture_image).sum();
+    let mean_square = squares as f64 / n as f64;
+    Ok(10.0 * (255.0_f64.powi(2) / mean_square).log10())
+}
+
+/// PSNR in dB of a picture whose colors are multiplied by gains; `None` if all pixels are masked. Values above white
+/// are not clamped.
+pub(super) fn psnr_with_gains(products: &[Products; 3], gains: [f64; 3]) -> Option<f64> {
+    let n: u64 = products.iter().map(|color| color.n_visible).sum();
+    let square = |(color, gain): (&Products, f64)| {
+        gain * gain * color.picture_picture as f64 - 2.0 * gain * color.picture_image as f64 + color.image_image as f64
+    };
+    let squares: f64 = products.iter().zip(gains).map(square).sum();
+    // A squared error of at least one bounds the score: one level of one color at one pixel.
+    (n > 0).then(|| 10.0 * (255.0f64.powi(2) * n as f64 / squares.max(1.0)).log10())
+}
+
+/// Logarithms of the gains that best match a picture to an image.
+pub(super) fn log_gains(products: &[Products; 3]) -> [f64; 3] {
+    const MAX_LOG_GAIN: f64 = 1.5; // Two photographic stops: larger gains are not caused by exposure.
+    products.map(|color| match (color.picture_image, color.picture_picture) {
+        (0, _) | (_, 0) => 0.0,
+        (with_image, picture_only) => (with_image as f64 / picture_only as f64).ln().clamp(-MAX_LOG_GAIN, MAX_LOG_GAIN),
+    })
+}

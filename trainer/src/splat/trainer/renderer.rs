@@ -1,0 +1,257 @@
+//! Draws splats from pinhole cameras. Its pipelines and scratch buffers are also those of the first part of a training
+//! step.
+
+use super::products::{self, Products};
+use super::recorder::Recorder;
+use crate::gpu::{Buffer, Gpu, Pipeline};
+use crate::splat::buffers::{ImageBuffers, Scratch, ScratchSize, SplatBuffers, n_bins, n_tiles};
+use crate::splat::kernels::DrawPipelines;
+use crate::splat::params::{Camera, Supervision, View, status};
+use crate::splat::passes::ViewPasses;
+use crate::{Error, Picture};
+
+/// Minimum number of entries of the bins' lists.
+const MIN_ENTRIES: u32 = 1 << 14;
+
+/// Draws pinhole views of splats.
+#[derive(Debug)]
+pub(super) struct Renderer {
+    pub(super) pipelines: DrawPipelines,
+    scratch: Option<(ScratchSize, Scratch)>,
+    image_buffers: Option<ImageBuffers>,
+    status: Buffer,
+    view: Buffer,
+    background: Buffer,
+    /// Image buffer of the last comparison with an image in host memory, for reuse.
+    compared: Option<Buffer>,
+}
+
+/// A view to draw.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct DrawnView<'a> {
+    pub(super) splats: &'a SplatBuffers,
+    pub(super) camera: &'a Camera,
+    pub(super) background_srgb: [f32; 3],
+}
+
+/// What is read back of a picture.
+#[derive(Clone, Copy, Debug)]
+enum ReadParts<'a> {
+    Picture {
+        depth: bool,
+    },
+    /// The sums of `score.wgsl` for a comparison with an image.
+    Comparison {
+        score: &'a Pipeline,
+        image: &'a Buffer,
+    },
+}
+
+impl Renderer {
+    pub(super) fn new(gpu: &Gpu) -> Result<Self, Error> {
+        Ok(Self {
+            pipelines: DrawPipelines::new(gpu)?,
+            scratch: None,
+            image_buffers: None,
+            status: gpu.storage_with("splat.draw_status", &[0; 4 * status::LEN])?,
+            view: gpu.uniform_with("splat.draw_view", &<View as bytemuck::Zeroable>::zeroed()),
+            background: gpu.uniform_with("splat.background", &<Supervision as bytemuck::Zeroable>::zeroed()),
+            compared: None,
+        })
+    }
+
+    /// Draws a picture.
+    pub(super) fn picture(
+        &mut self,
+        recorder: &mut Recorder,
+        drawn: DrawnView<'_>,
+        depth: bool,
+    ) -> Result<Picture, Error> {
+        let size_px = drawn.camera.size_px;
+        self.draw(recorder, drawn, ReadParts::Picture { depth }, |parts| Picture::from_parts(size_px, parts))
+    }
+
+    /// Draws a picture and compares it with an image of the same size.
+    pub(super) fn compare(
+        &mut self,
+        recorder: &mut Recorder,
+        drawn: DrawnView<'_>,
+        score: &Pipeline,
+        image: &Buffer,
+    ) -> Result<[Products; 3], Error> {
+        let sum_up = |parts: &[&[u8]]| products::sum_up(&bytemuck::pod_collect_to_vec::<u8, [u32; 4]>(parts[0]));
+        self.draw(recorder, drawn, ReadParts::Comparison { score, image }, sum_up)
+    }
+
+    /// Draws a picture and compares it with an image of the same size in host memory.
+    pub(super) fn compare_with_upload(
+        &mut self,
+        recorder: &mut Recorder,
+        drawn: DrawnView<'_>,
+        score: &Pipeline,
+        rgba: &[u8],
+    ) -> Result<[Products; 3], Error> {
+        let image = match self.compared.take() {
+            Some(image) if image.bytes() >= rgba.len() as u64 => {
+                recorder.gpu.write(&image, 0, rgba);
+                image
+            }
+            _ => {
+                recorder.passes.clear_bindings();
+                recorder.gpu.storage_with("splat.compared", rgba)?
+            }
+        };
+        let products = self.compare(recorder, drawn, score, &image)?;
+        self.compared = Some(image);
+        Ok(products)
+    }
+
+    /// Draws a view and passes the bytes of the requested parts to `take`. The same read returns counters that show
+    /// whether all intersections fitted; if not, the view is drawn again.
+    fn draw<R>(
+        &mut self,
+        recorder: &mut Recorder,
+        DrawnView { splats, camera, background_srgb: [red, green, blue] }: DrawnView<'_>,
+        parts: ReadParts<'_>,
+        take: impl Fn(&[&[u8]]) -> R,
+    ) -> Result<R, Error> {
+        let size_px = camera.size_px;
+        recorder.gpu.write(&self.view, 0, bytemuck::bytes_of(&camera.view()));
+        let background = Supervision { background_srgb: [red, green, blue, 0.0], ..bytemuck::Zeroable::zeroed() };
+        recorder.gpu.write(&self.background, 0, bytemuck::bytes_of(&background));
+        loop {
+            self.reserve_view(recorder, splats.capacity, size_px, false)?;
+            reserve_image(recorder, &mut self.image_buffers, size_px, false)?;
+            let (status, view, image_buffers) =
+                (&self.status, &self.view, self.image_buffers.as_ref().ok_or(Error::DeviceLost)?);
+            let Recorder { gpu, passes: list } = recorder;
+            write_n_splats(gpu, status, splats.n_splats);
+            let passes = ViewPasses { gpu, splats, scratch: self.scratch()?, image_buffers, status, view, size_px };
+            passes.draw(list, &self.pipelines);
+            passes.finish(list, &self.pipelines, &self.background);
+            let mut read = vec![(status, 4 * status::LEN)];
+            match parts {
+                ReadParts::Picture { depth } => {
+                    let depths = depth.then_some(&image_buffers.depths);
+                    read.extend(Picture::buffers(size_px, &image_buffers.pixels, depths));
+                }
+                ReadParts::Comparison { score, image } => {
+                    let n_bytes = products::record(gpu, list, score, (view, image_buffers), size_px, image);
+                    read.push((&image_buffers.products, n_bytes));
+                }
+            }
+            let (counters, taken) = list.submit_reading(gpu, &read).finish_with(gpu, |parts| {
+                let counters: Vec<u32> = bytemuck::pod_collect_to_vec(parts[0]);
+                let taken = (counters[status::FAILED] == 0).then(|| take(&parts[1..]));
+                (counters, taken)
+            })?;
+            if let Some(taken) = taken {
+                return Ok(taken);
+            }
+            if !self.grow_scratch(recorder, &counters)? {
+                return Err(Error::DeviceLost);
+            }
+            clear_failure(&recorder.gpu, &self.status);
+        }
+    }
+
+    /// The scratch buffers, after they were reserved.
+    pub(super) fn scratch(&self) -> Result<&Scratch, Error> {
+        self.scratch.as_ref().map(|(_, scratch)| scratch).ok_or(Error::DeviceLost)
+    }
+
+    /// Ensures that a view of this size of up to `capacity` splats can be drawn, or trained on.
+    pub(super) fn reserve_view(
+        &mut self,
+        recorder: &mut Recorder,
+        capacity: u32,
+        size_px: [u32; 2],
+        learned: bool,
+    ) -> Result<(), Error> {
+        let n_entries = (2 * capacity).max(MIN_ENTRIES);
+        let n_slots = if learned { 2 * n_entries } else { 0 };
+        self.reserve(recorder, ScratchSize { n_splats: capacity, n_entries, n_slots, n_bins: n_bins(size_px) })
+    }
+
+    /// Ensures that views of up to `capacity` splats can be drawn; does nothing before the first view.
+    pub(super) fn reserve_splats(&mut self, recorder: &mut Recorder, capacity: u32) -> Result<(), Error> {
+        let Some((have, _)) = self.scratch else { return Ok(()) };
+        let n_entries = have.n_entries.max(2 * capacity);
+        let n_slots = if have.n_slots > 0 { have.n_slots.max(4 * capacity) } else { 0 };
+        self.reserve(recorder, ScratchSize { n_splats: capacity, n_entries, n_slots, ..have })
+    }
+
+    /// Grows the scratch buffers after a failed submit. Returns whether it had failed.
+    pub(super) fn grow_scratch(&mut self, recorder: &mut Recorder, counters: &[u32]) -> Result<bool, Error> {
+        if counters[status::FAILED] == 0 {
+            return Ok(false);
+        }
+        let Some((size, _)) = self.scratch else { return Ok(false) };
+        let larger = |need: u32, have: u32| if need > have { need.saturating_add(need / 2) } else { have };
+        let need = ScratchSize {
+            n_entries: larger(counters[status::NEED_ENTRIES], size.n_entries),
+            n_slots: if size.n_slots == 0 { 0 } else { larger(counters[status::NEED_SLOTS], size.n_slots) },
+            ..size
+        };
+        log::debug!("splat: intersections need {need:?}");
+        self.reserve(recorder, need)?;
+        Ok(true)
+    }
+
+    fn reserve(&mut self, recorder: &mut Recorder, need: ScratchSize) -> Result<(), Error> {
+        let have = self.scratch.as_ref().map(|(size, _)| *size);
+        let fits = have.is_some_and(|have| {
+            have.n_splats >= need.n_splats
+                && have.n_entries >= need.n_entries
+                && have.n_slots >= need.n_slots
+                && have.n_bins >= need.n_bins
+        });
+        if fits {
+            return Ok(());
+        }
+        let other = have.unwrap_or(need);
+        let size = ScratchSize {
+            n_splats: need.n_splats.max(other.n_splats),
+            n_entries: need.n_entries.max(other.n_entries),
+            n_slots: need.n_slots.max(other.n_slots),
+            n_bins: need.n_bins.max(other.n_bins),
+        };
+        recorder.submit_and_release_buffers();
+        self.scratch = None; // Freed before the larger one is allocated.
+        let made = Scratch::new(&recorder.gpu, &self.pipelines, size);
+        if made.is_err()
+            && let Some(had) = have
+        {
+            self.scratch = Some((had, Scratch::new(&recorder.gpu, &self.pipelines, had)?));
+        }
+        self.scratch = Some((size, made?));
+        Ok(())
+    }
+}
+
+/// Ensures that a picture of this size fits into the buffers; those of gradients only if `learned`.
+pub(super) fn reserve_image(
+    recorder: &mut Recorder,
+    image_buffers: &mut Option<ImageBuffers>,
+    size_px: [u32; 2],
+    learned: bool,
+) -> Result<(), Error> {
+    let need = (size_px[0] * size_px[1], n_tiles(size_px));
+    let have = image_buffers.as_ref().map_or((0, 0), |buffers| (buffers.n_pixels, buffers.n_tiles));
+    if image_buffers.is_none() || have.0 < need.0 || have.1 < need.1 {
+        recorder.submit_and_release_buffers();
+        *image_buffers = None; // Freed before the larger one is allocated.
+        *image_buffers = Some(ImageBuffers::new(&recorder.gpu, need.0.max(have.0), need.1.max(have.1), learned)?);
+    }
+    Ok(())
+}
+
+/// Sets the number of splats for the next passes that use this status.
+pub(super) fn write_n_splats(gpu: &Gpu, status: &Buffer, n_splats: u32) {
+    gpu.write(status, 4 * u64::from(status::N_SPLATS), bytemuck::bytes_of(&n_splats));
+}
+
+/// Clears the failure of a submit and the sizes that it needed.
+pub(super) fn clear_failure(gpu: &Gpu, status: &Buffer) {
+    gpu.write(status, 4 * status::FAILED as u64, &[0; 12]);
+}

@@ -1,0 +1,106 @@
+//! Initial splats at the surfaces that keyframes show when they arrive.
+
+use super::view_set::ViewSet;
+use crate::model_options::ModelOptions;
+use crate::splat::arrays::SplatArrays;
+use crate::splat::options::SplatOptions;
+use crate::splat::seed::Density;
+use crate::splat::snapshot::ObservedScene;
+use keyframe::Keyframe;
+use kinematics::quantile::{Rank, quantile};
+use std::sync::Arc;
+
+/// Maximum share of the splat limit that the seeds of one image may take, so that other images get some, too.
+const SEED_SHARE: f64 = 1.0 / 8.0;
+/// Minimum number of pixels per seed. With more seeds, the first steps take longer than they gain.
+const PX_PER_SEED: f64 = 48.0;
+/// Maximum number of seeds per image, by default.
+const SEEDS_PER_IMAGE: f64 = 20_000.0;
+const SOFTWARE_SEEDS_PER_IMAGE: f64 = 4_000.0;
+/// Minimum scale of the scene.
+const MIN_SCENE_SIZE_M: f64 = 1e-3;
+
+/// Creates splats for keyframes that arrive.
+#[derive(Debug)]
+pub(super) struct Seeding {
+    pub(super) scene: ObservedScene,
+    /// Keyframes whose depth has not been used for seeding yet.
+    pending: Vec<Arc<Keyframe>>,
+    /// Keyframes without dense depth that arrived since the last step.
+    unseeded: Vec<Arc<Keyframe>>,
+    density: Density,
+}
+
+impl Seeding {
+    pub(super) fn new(options: &ModelOptions<SplatOptions>, is_software: bool) -> Self {
+        let default_seeds = if is_software { SOFTWARE_SEEDS_PER_IMAGE } else { SEEDS_PER_IMAGE };
+        let max_discs =
+            options.specific.seeds_per_image.unwrap_or(default_seeds).min(f64::from(options.cap()) * SEED_SHARE);
+        Self {
+            scene: ObservedScene::default(),
+            pending: Vec::new(),
+            unseeded: Vec::new(),
+            density: Density { max_discs, px_per_disc: PX_PER_SEED },
+        }
+    }
+
+    /// Maximum number of seeds per image.
+    pub(super) fn seeds_per_image(&self) -> f64 {
+        self.density.max_discs
+    }
+
+    /// Adds a keyframe whose splats are still missing.
+    pub(super) fn push(&mut self, keyframe: Arc<Keyframe>) {
+        self.scene.has_depth |= keyframe.depth.is_some();
+        self.pending.push(keyframe);
+    }
+
+    pub(super) fn remove(&mut self, is_removed: impl Fn(&Keyframe) -> bool) {
+        self.pending.retain(|keyframe| !is_removed(keyframe));
+        self.unseeded.retain(|keyframe| !is_removed(keyframe));
+    }
+
+    /// Discs at new depth readings of the keyframes that arrived since the last call; `None` if none arrived. `views`
+    /// are all training views.
+    pub(super) fn discs_from_depth(&mut self, views: &ViewSet) -> Option<SplatArrays> {
+        let arrived = std::mem::take(&mut self.pending);
+        if arrived.is_empty() {
+            return None;
+        }
+        self.scene.size_m = scene_size_m(views);
+        let discs = self.scene.seeder.discs(&arrived, self.density);
+        self.unseeded.extend(arrived.into_iter().filter(|keyframe| keyframe.lacks_dense_depth()));
+        Some(discs)
+    }
+
+    /// Keyframes with areas that depth does not cover.
+    pub(super) fn take_unseeded(&mut self) -> Vec<Arc<Keyframe>> {
+        std::mem::take(&mut self.unseeded)
+    }
+
+    /// Discs for the areas of a keyframe that depth does not cover; `None` if there is no depth at all.
+    pub(super) fn discs_without_depth(&mut self, keyframe: &Keyframe) -> Option<SplatArrays> {
+        let ObservedScene { seeder, size_m, has_depth } = &mut self.scene;
+        has_depth.then(|| seeder.discs_without_depth(keyframe, self.density, *size_m))
+    }
+
+    /// Keyframes without dense depth that arrived since the last step.
+    pub(super) fn unseeded(&self) -> &[Arc<Keyframe>] {
+        &self.unseeded
+    }
+
+    /// Restores the state of a checkpoint.
+    pub(super) fn restore(&mut self, scene: ObservedScene, unseeded: Vec<Arc<Keyframe>>) {
+        (self.scene, self.unseeded) = (scene, unseeded);
+    }
+}
+
+/// Scale of the scene for the learning rate of the means, from the spread of the cameras or their median depth.
+fn scene_size_m(views: &ViewSet) -> f64 {
+    let centers: Vec<_> = views.keyframes().map(|keyframe| keyframe.world_from_camera.translation.vector).collect();
+    let middle = centers.iter().sum::<nalgebra::Vector3<f64>>() / centers.len().max(1) as f64;
+    let spread = centers.iter().map(|center| (center - middle).norm()).fold(0.0, f64::max);
+    let mut depths: Vec<f64> = views.iter().filter_map(|view| view.median_depth_m).collect();
+    let median_depth_m = quantile(&mut depths, 0.5, Rank::Upper).unwrap_or(spread);
+    (1.1 * spread).max(0.5 * median_depth_m).max(MIN_SCENE_SIZE_M)
+}

@@ -1,0 +1,145 @@
+//! Training steps: what is due before a submit, its length, and its results.
+
+use super::SplatTrainer;
+use super::learning_rates;
+use super::optimizer::StepContext;
+use super::recorder::Recorder;
+use crate::Error;
+use crate::gpu::PassTiming;
+use crate::splat::kernels::TrainPipelines;
+use crate::splat::params::status;
+use std::time::Instant;
+
+/// Maximum number of steps per submit.
+const MAX_STEPS_PER_SUBMIT: u64 = 64;
+/// Number of images prepared and uploaded together while pictures are requested. A larger number would delay pictures
+/// too much.
+const VIEWS_AT_ONCE_WATCHED: u64 = 4;
+
+impl SplatTrainer {
+    /// Queues at most `n` steps, see [`Method::step`](crate::Method::step).
+    pub(super) fn train(&mut self, n: u64) -> Result<u64, Error> {
+        if self.views.is_empty() {
+            return Ok(0);
+        }
+        self.prepare_training()?;
+        if self.model.splats.n_splats == 0 {
+            return Ok(0);
+        }
+        let learn = self.learn()?;
+        self.try_when_due()?;
+        self.grow_when_due(&learn)?;
+        let n_steps = self.n_steps_of_submit(n);
+        self.model.splats.set_active_degree(&self.recorder.gpu, self.schedule.active_degree());
+        self.write_settings();
+        let since = Instant::now();
+        self.prepare_images(n_steps)?;
+        for step in self.schedule.step..self.schedule.step + n_steps {
+            self.record_step(&learn, step)?;
+        }
+        let counters = self.optimizer.submit(&mut self.recorder);
+        self.schedule.step += n_steps;
+        let failed = self.finish_in_flight()?; // The previous submit; this one runs meanwhile.
+        if !failed {
+            self.optimizer.submits.begin(counters, n_steps, since);
+        } // Otherwise this submit failed, too: its steps are repeated, so do not wait for it.
+        if n_steps == n {
+            self.finish_in_flight()?; // The caller stops here, so the step count must be exact.
+        }
+        Ok(n_steps)
+    }
+
+    /// Takes one step with timestamps around every pass.
+    pub(super) fn profile(&mut self) -> Result<Vec<PassTiming>, Error> {
+        self.finish_in_flight()?;
+        self.prepare_training()?;
+        let learn = self.learn()?;
+        self.write_settings();
+        self.record_step(&learn, self.schedule.step)?;
+        let timings = self.recorder.passes.submit_timed(&self.recorder.gpu)?;
+        self.schedule.step += 1;
+        Ok(timings)
+    }
+
+    /// Changes the splat count when due: replaces dead splats, and adds splats up to the limit.
+    fn grow_when_due(&mut self, learn: &TrainPipelines) -> Result<(), Error> {
+        if !self.schedule.is_growth_due() {
+            return Ok(());
+        }
+        self.finish_in_flight()?;
+        if !self.schedule.is_growth_due() {
+            return Ok(()); // The submit failed; the change is due again once its steps are repeated.
+        }
+        self.schedule.last_growth_step = self.schedule.step;
+        let growth_frac = if self.trials.may_grow() { self.options.specific.growth_frac } else { 0.0 };
+        let key = growth_key(self.options.common.seed, self.schedule.step);
+        self.model.grow(&mut self.recorder, &mut self.renderer, learn, growth_frac, key)
+    }
+
+    /// Number of steps of the next submit: few enough for its time limit, and none past a step at which something else
+    /// is due.
+    fn n_steps_of_submit(&self, n_requested: u64) -> u64 {
+        let by_time = self.optimizer.submits.n_steps_in_limit().unwrap_or(1);
+        n_requested
+            .min(by_time.clamp(1, MAX_STEPS_PER_SUBMIT))
+            .min(self.schedule.steps_to_next_change())
+            .min(self.trials.steps_left(self.schedule.step))
+    }
+
+    /// Uploads the settings of the next steps.
+    fn write_settings(&self) {
+        let Self { options, recorder: Recorder { gpu, .. }, model, optimizer, schedule, views, seeding, .. } = self;
+        if !model.cameras.set.is_empty() {
+            model.cameras.write_rule(gpu, schedule.completed_frac(), seeding.scene.size_m);
+        }
+        let n_splats = model.splats.n_splats;
+        optimizer.set_n_splats(gpu, n_splats);
+        optimizer.write_rule(gpu, &learning_rates::rule(options, schedule, &seeding.scene, views.len(), n_splats));
+    }
+
+    /// Uploads the missing images of the next `n` steps. On a GPU, prepares enough images to use all processors, so
+    /// that the time of a step does not include that of its images.
+    fn prepare_images(&mut self, n: u64) -> Result<(), Error> {
+        let n_at_once = match (self.recorder.gpu.is_software(), self.optimizer.submits.is_watched()) {
+            (true, _) => 0,
+            (false, true) => VIEWS_AT_ONCE_WATCHED,
+            (false, false) => MAX_STEPS_PER_SUBMIT,
+        };
+        let step = self.schedule.step;
+        self.views.prepare_steps(&mut self.recorder, step..step + n, n_at_once)
+    }
+
+    /// Records the passes of one step.
+    fn record_step(&mut self, learn: &TrainPipelines, step: u64) -> Result<(), Error> {
+        let place = self.views.of_step(step);
+        self.views.ensure_level(&mut self.recorder, place, self.schedule.step)?;
+        self.reserve_view(self.views.size_px(place))?;
+        let Self { recorder: Recorder { gpu, passes }, model, renderer, optimizer, views, .. } = self;
+        let context = StepContext { gpu, learn, renderer, model };
+        optimizer.record_step(&context, passes, views.ready_level(place)?)
+    }
+
+    /// Allocates the buffers for training on images of this size.
+    pub(super) fn reserve_view(&mut self, size_px: [u32; 2]) -> Result<(), Error> {
+        let capacity = self.model.splats.capacity;
+        self.optimizer.reserve_view(&mut self.recorder, &mut self.renderer, capacity, size_px)
+    }
+
+    /// Waits for the submit in flight and applies its counters. Returns whether a buffer was too small for it.
+    pub(super) fn finish_in_flight(&mut self) -> Result<bool, Error> {
+        let Some(counters) = self.optimizer.submits.finish(&self.recorder.gpu)? else { return Ok(false) };
+        self.optimizer.log_non_finite(counters[status::N_NON_FINITE].into());
+        let failed = self.renderer.grow_scratch(&mut self.recorder, &counters)?;
+        if failed {
+            self.schedule.step = u64::from(counters[status::STEP]);
+            self.optimizer.clear_failure(&self.recorder.gpu);
+        }
+        Ok(failed)
+    }
+}
+
+/// Seed of the random choices of one change of the splat count.
+#[expect(clippy::cast_possible_truncation, reason = "bits of a hash")]
+fn growth_key(seed: u64, step: u64) -> u32 {
+    (step as u32).wrapping_mul(0x9e37_79b9) ^ seed as u32
+}

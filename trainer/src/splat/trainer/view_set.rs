@@ -1,0 +1,200 @@
+//! The training views: the order in which they are trained on, their resolution, and their images on the GPU.
+
+use super::recorder::Recorder;
+use crate::Error;
+use crate::gpu::{Buffer, Gpu};
+use crate::model_options::ModelOptions;
+use crate::splat::camera_params::CameraParams;
+use crate::splat::options::SplatOptions;
+use crate::splat::views::{self, Keep, Level, LevelImages, Order, TrainView};
+use keyframe::Keyframe;
+use rayon::prelude::*;
+use std::collections::BTreeSet;
+use std::ops::Range;
+use std::sync::Arc;
+
+/// Maximum bytes of images on a software adapter, which shares the host memory that already holds all keyframes.
+const SOFTWARE_IMAGE_BYTES: u64 = 256 << 20;
+/// Number of images uploaded together when all views are processed in turn.
+pub(super) const VIEWS_AT_ONCE: usize = 16;
+/// Steps at a quarter of the resolution, and step from which the full resolution is used, by default.
+const COARSE_STEPS: [u64; 2] = [150, 400];
+const SOFTWARE_COARSE_STEPS: [u64; 2] = [500, 4000];
+
+/// Training views.
+#[derive(Debug)]
+pub(super) struct ViewSet {
+    views: Vec<TrainView>,
+    order: Order,
+    coarse_steps: [u64; 2],
+    /// Maximum bytes of the views' images on the GPU, unless a submit needs more.
+    max_image_bytes: u64,
+    /// Number of requests for images, for evicting the least recently used ones.
+    n_image_requests: u64,
+}
+
+/// Index of a view, and of a level of its images.
+pub(super) type ViewLevel = (usize, usize);
+
+impl ViewSet {
+    /// An empty set.
+    pub(super) fn new(options: &ModelOptions<SplatOptions>, is_software: bool) -> Self {
+        Self {
+            views: Vec::new(),
+            order: Order::new(options.common.seed),
+            coarse_steps: options.specific.coarse_steps.unwrap_or(if is_software {
+                SOFTWARE_COARSE_STEPS
+            } else {
+                COARSE_STEPS
+            }),
+            max_image_bytes: if is_software { SOFTWARE_IMAGE_BYTES } else { u64::MAX },
+            n_image_requests: 0,
+        }
+    }
+
+    pub(super) fn len(&self) -> usize {
+        self.views.len()
+    }
+
+    pub(super) fn is_empty(&self) -> bool {
+        self.views.is_empty()
+    }
+
+    /// Views in the order of their arrival.
+    pub(super) fn iter(&self) -> std::slice::Iter<'_, TrainView> {
+        self.views.iter()
+    }
+
+    pub(super) fn keyframes(&self) -> impl Iterator<Item = &Arc<Keyframe>> {
+        self.views.iter().map(|view| &view.keyframe)
+    }
+
+    pub(super) fn keyframe(&self, view_ix: usize) -> &Arc<Keyframe> {
+        &self.views[view_ix].keyframe
+    }
+
+    pub(super) fn push(&mut self, keyframe: Arc<Keyframe>) {
+        self.views.push(TrainView::new(keyframe));
+    }
+
+    pub(super) fn retain(&mut self, is_kept: impl Fn(&Arc<Keyframe>) -> bool) {
+        self.views.retain(|view| is_kept(&view.keyframe));
+    }
+
+    /// Replaces all views.
+    pub(super) fn replace(&mut self, keyframes: impl IntoIterator<Item = Arc<Keyframe>>) {
+        self.views = keyframes.into_iter().map(TrainView::new).collect();
+    }
+
+    /// See [`SplatOptions::coarse_steps`].
+    pub(super) fn coarse_steps(&self) -> [u64; 2] {
+        self.coarse_steps
+    }
+
+    /// Allocates slots for the camera parameters of all views.
+    pub(super) fn assign_lenses(&mut self, gpu: &Gpu, cameras: &mut CameraParams) -> Result<(), Error> {
+        self.views.iter_mut().try_for_each(|view| view.assign_lens(gpu, cameras))
+    }
+
+    /// The view and level that a step trains on.
+    pub(super) fn of_step(&mut self, step: u64) -> ViewLevel {
+        let view_ix = self.order.pick(step, self.views.len());
+        (view_ix, self.views[view_ix].clamped(level_at(step, self.coarse_steps)))
+    }
+
+    /// Size of the image of a view at a level, pixels.
+    pub(super) fn size_px(&self, (view_ix, level_ix): ViewLevel) -> [u32; 2] {
+        self.views[view_ix].size_at(level_ix)
+    }
+
+    /// The lens of a view, if there is one, and a level whose images are uploaded.
+    pub(super) fn ready_level(&self, (view_ix, level_ix): ViewLevel) -> Result<(Option<&Buffer>, &Level), Error> {
+        self.views[view_ix].ready_level(level_ix)
+    }
+
+    /// Uploads the missing images of these steps. If any is missing, uploads those of the first `n_at_once` steps, too.
+    pub(super) fn prepare_steps(
+        &mut self,
+        recorder: &mut Recorder,
+        steps: Range<u64>,
+        n_at_once: u64,
+    ) -> Result<(), Error> {
+        let mut requested = self.levels_of_steps(steps.clone());
+        if !requested.iter().all(|place| self.has_level(*place)) {
+            requested = self.levels_of_steps(steps.start..steps.end.max(steps.start + n_at_once));
+        }
+        self.upload(recorder, &requested, steps.start)
+    }
+
+    fn levels_of_steps(&mut self, steps: Range<u64>) -> BTreeSet<ViewLevel> {
+        steps.map(|step| self.of_step(step)).collect()
+    }
+
+    fn has_level(&self, (view_ix, level_ix): ViewLevel) -> bool {
+        self.views[view_ix].has_level(level_ix)
+    }
+
+    /// Uploads the missing ones of these levels of views at a step, using all processors. Other images may be evicted.
+    pub(super) fn upload(
+        &mut self,
+        recorder: &mut Recorder,
+        requested: &BTreeSet<ViewLevel>,
+        step: u64,
+    ) -> Result<(), Error> {
+        let missing: Vec<ViewLevel> = requested.iter().copied().filter(|place| !self.has_level(*place)).collect();
+        if !missing.is_empty() {
+            let made: Vec<LevelImages> = missing
+                .par_iter()
+                .map(|(view_ix, level)| LevelImages::new(&self.views[*view_ix].keyframe, *level))
+                .collect();
+            let new_bytes = made.iter().map(LevelImages::bytes).sum();
+            let keep = Keep {
+                needed: requested,
+                coarsest: level_at(step, self.coarse_steps),
+                max_bytes: self.max_image_bytes.saturating_sub(new_bytes),
+            };
+            let mut dropped = views::drop_levels(&mut self.views, keep);
+            if !dropped.is_empty() && !recorder.passes.is_empty() {
+                recorder.submit(); // The recorded passes use the images that are replaced.
+            }
+            for ((view_ix, level), images) in missing.into_iter().zip(&made) {
+                let same_size = dropped.iter().position(|level| level.size_px == images.size_px());
+                let reused = same_size.map(|ix| dropped.swap_remove(ix));
+                self.views[view_ix].upload(&recorder.gpu, level, images, reused)?;
+            }
+            if !dropped.is_empty() {
+                recorder.passes.clear_bindings();
+            }
+        }
+        self.n_image_requests += 1;
+        for (view_ix, level) in requested {
+            self.views[*view_ix].mark_used(*level, self.n_image_requests);
+        }
+        Ok(())
+    }
+
+    /// Uploads the images of a view and level, if they are missing.
+    pub(super) fn ensure_level(&mut self, recorder: &mut Recorder, place: ViewLevel, step: u64) -> Result<(), Error> {
+        if self.has_level(place) { Ok(()) } else { self.upload(recorder, &BTreeSet::from([place]), step) }
+    }
+
+    /// Limits the bytes of images on the GPU, as on a software adapter.
+    #[cfg(test)]
+    pub(super) fn limit_image_bytes(&mut self, max_bytes: u64) {
+        self.max_image_bytes = max_bytes;
+    }
+
+    #[cfg(test)]
+    pub(super) fn image_bytes(&self) -> u64 {
+        self.views.iter().map(TrainView::image_bytes).sum()
+    }
+}
+
+/// Resolution level at a step: images are smaller than full size by this power of two.
+fn level_at(step: u64, coarse_steps: [u64; 2]) -> u32 {
+    match step {
+        step if step < coarse_steps[0] => 2,
+        step if step < coarse_steps[1] => 1,
+        _ => 0,
+    }
+}
