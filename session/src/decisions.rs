@@ -1,4 +1,5 @@
-//! The log of timing-dependent decisions: at which step each keyframe was added or removed, and when training ended.
+//! The log of timing-dependent decisions: at which step each keyframe was added or removed, when the result of an
+//! alignment was applied, and when training ended.
 //!
 //! One JSON object per line, see `docs/reference/files.md`. The log contains no times: replaying it with the same data
 //! gives the same model.
@@ -17,7 +18,7 @@ use std::sync::mpsc::{SyncSender, sync_channel};
 use std::thread::JoinHandle;
 use trainer::ModelOptions;
 
-const VERSION: u64 = 3;
+const VERSION: u64 = 4;
 /// Name of the log in the run folder.
 const FILE: &str = "decisions.jsonl";
 /// Maximum number of decisions that wait for the disk. When the queue is full, training waits.
@@ -110,6 +111,8 @@ pub enum Decision {
     Seed(True),
     /// Training on the keyframes so far was started before the next one was added, but no update was made yet.
     Begin(True),
+    /// The result of an alignment in the background was applied.
+    Align(True),
     /// A checkpoint was taken at this step.
     Checkpoint(True),
     /// Training ended.
@@ -266,6 +269,12 @@ impl DecisionLog {
         self.log_activity(step);
         let removed_keyframe = Removed { camera: camera.to_owned(), stamp_nanos: stamp.0 };
         self.write(Line::Entry(Entry { step, decision: Decision::Remove(removed_keyframe) }));
+    }
+
+    /// Logs that the result of an alignment was applied after this many steps.
+    pub fn aligned(&mut self, step: u64) {
+        self.log_activity(step);
+        self.write(Line::Entry(Entry { step, decision: Decision::Align(True) }));
     }
 
     /// Records that a viewer requested a picture.

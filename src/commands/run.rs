@@ -20,10 +20,9 @@ use session::methods::{self, COUNT};
 use session::next_commands::{DataSource, quoted};
 use session::run_folder::{self, CreatedFolders};
 use session::{
-    AvailableData, Checkpoints, Clock, DecisionLog, EndingSession, Evaluator, Evaluators, FinishedModel,
-    LIVE_ALIGNMENT_KEYFRAMES, Limits, Live, LiveOptions, ModelViewer, Pace, REALIGN, Recovery, RefineSettings,
-    RunDescription, RunFlags, ServedModel, Session, Settings, StoredKeyframes, Viewers, checkpoints, methods_of,
-    recovery,
+    AvailableData, Checkpoints, Clock, DecisionLog, EndingSession, Evaluator, Evaluators, FinishedModel, Limits, Live,
+    LiveOptions, ModelViewer, Pace, REALIGN, Recovery, RefineSettings, RunDescription, RunFlags, ServedModel, Session,
+    Settings, StoredKeyframes, Viewers, checkpoints, methods_of, recovery,
 };
 use std::collections::BTreeMap;
 use std::io::IsTerminal;
@@ -283,7 +282,7 @@ pub(super) fn start(
     let pace = args.pace(&rig)?;
     let gpu = open_gpu()?;
     let RefineSettings { align, with_scene: cameras } = training.refining_live(available, gpu.is_software())?;
-    let common = CommonOptions { cameras, align, align_at_keyframes: LIVE_ALIGNMENT_KEYFRAMES.to_vec(), ..common };
+    let common = CommonOptions { cameras, align, align_timing: pace.align_timing(), ..common };
     let models: Vec<Resumed> = match previous {
         Some(previous) => vec![trainer::resume(gpu.clone(), &previous.checkpoint, &previous.keyframes)?],
         None => {
