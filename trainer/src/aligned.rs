@@ -20,7 +20,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
 
-/// Key of the alignment in the state of a checkpoint, and in `model.json`.
+/// Key of the alignment state in a checkpoint. [`METADATA_KEY`] is the key of the alignment in `model.json`.
 const STATE_KEY: &str = "aligned";
 const METADATA_KEY: &str = "alignment";
 
@@ -56,19 +56,19 @@ pub trait Recalibrate: Method {
 /// A resumed model, and the keyframes that it was not trained on.
 pub type ResumedModel = (Box<dyn Method>, Vec<Arc<Keyframe>>);
 
-/// A model, and the alignment of its keyframes' cameras.
+/// A model with alignment of its keyframes' cameras.
 #[derive(Debug)]
 pub struct Aligned<M> {
     model: M,
     choice: CameraRefinement,
     alignment_task: AlignmentTask,
-    /// The uncorrected keyframes in the order of their arrival, kept until alignment is done.
+    /// The uncorrected keyframes in order of arrival, kept until alignment is done.
     original_keyframes: Vec<Arc<Keyframe>>,
-    /// How many of them had arrived when alignment began; `None` before that.
+    /// Number of original keyframes when alignment began; `None` before that.
     n_begun: Option<usize>,
-    /// Number of steps from the beginning of alignment to the use of its result.
+    /// Number of steps from the start of alignment until its result is applied.
     alignment_steps: u64,
-    /// Step at which the result of the alignment that has begun is due.
+    /// Step at which the result of the running alignment is due.
     due_step: Option<u64>,
     timing: AlignTiming,
     /// Number of keyframes at which the next alignment begins.
@@ -115,7 +115,7 @@ impl<M: Recalibrate + 'static> Aligned<M> {
         }
     }
 
-    /// The model itself if no alignment is requested, otherwise with alignment.
+    /// Wraps the model with alignment if the options request it.
     pub fn if_requested(model: M, common: &CommonOptions, gpu: &Gpu) -> Box<dyn Method> {
         if common.align == CameraRefinement::default() {
             return Box::new(model);
@@ -134,8 +134,8 @@ impl<M: Recalibrate + 'static> Aligned<M> {
         Ok(Self { alignment_task, ..Self::new(model, CameraRefinement::default(), false, 0) })
     }
 
-    /// Resumes from a checkpoint. `resume` receives the corrected keyframes and finds those that the model was trained
-    /// on.
+    /// Resumes from a checkpoint. `resume` receives the corrected keyframes, and returns the model and the keyframes
+    /// that it was not trained on.
     pub fn resume(
         checkpoint: &Checkpoint,
         keyframes: &[Arc<Keyframe>],
@@ -168,7 +168,7 @@ impl<M: Recalibrate + 'static> Aligned<M> {
         let originals: BTreeMap<_, _> = keyframes.iter().map(|keyframe| (id_of(keyframe), keyframe)).collect();
         let original = |id: (&str, i64)| originals.get(&id).map(|keyframe| Arc::clone(keyframe));
         let original_keyframes = ids.iter().filter_map(|(camera, nanos)| original((camera, *nanos))).collect();
-        // These are corrected when they are pushed again.
+        // Uncorrected, because `push` corrects them.
         let untrained = untrained.iter().filter_map(|keyframe| original(id_of(keyframe))).collect();
         let aligned = Self {
             model,
@@ -185,7 +185,7 @@ impl<M: Recalibrate + 'static> Aligned<M> {
         Ok((Box::new(aligned), untrained))
     }
 
-    /// Starts alignment, if it is requested and there are enough keyframes.
+    /// Starts alignment if it is requested and there are enough keyframes.
     fn begin_alignment(&mut self) {
         let n_keyframes = self.original_keyframes.len();
         let has_enough = self.n_begun.is_some() || n_keyframes >= self.begins_at;
@@ -263,7 +263,7 @@ impl<M: Recalibrate + 'static> Method for Aligned<M> {
     fn push(&mut self, keyframe: Arc<Keyframe>) -> Result<(), Error> {
         self.model.push(self.alignment_task.corrected(&keyframe))?;
         let is_used = !self.alignment_task.is_done() && keyframe.split != Split::Test && keyframe.is_finite();
-        // After resuming, validation keyframes are pushed again.
+        // Validation keyframes are pushed again after resuming.
         if is_used && !self.original_keyframes.iter().any(|known| id_of(known) == id_of(&keyframe)) {
             self.original_keyframes.push(keyframe);
         }
@@ -416,7 +416,7 @@ mod tests {
     use calibration::ParamSet;
     use calibration::scenes::{Miscalibration, capture, remaining, wrong_extrinsics};
 
-    /// The step at which the result is applied.
+    /// Step at which the alignment result is applied.
     const ALIGNMENT_STEP: u64 = 6;
 
     fn tsdf(gpu: &Arc<Gpu>) -> TsdfModel {
@@ -509,7 +509,7 @@ mod tests {
         assert_eq!(
             interrupted.checkpoint().unwrap().finish().unwrap(),
             uninterrupted_end,
-            "resumed when alignment is due"
+            "must also match if resumed at the step at which alignment is due"
         );
 
         let folder = tempfile::tempdir().unwrap();
@@ -566,7 +566,7 @@ mod tests {
     }
 
     #[test]
-    fn empty_model_is_idle_and_unalignable_one_trains_on() {
+    fn empty_model_is_idle_and_failed_alignment_does_not_stop_training() {
         let gpu = Gpu::open(&GpuOptions::default()).unwrap();
         check_training_continues(tsdf(&gpu));
         check_training_continues(nerf(&gpu));

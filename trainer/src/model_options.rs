@@ -1,4 +1,4 @@
-//! Options of a model: those that all methods share, and those of its method.
+//! Options of a model: common options of all methods, and options specific to its method.
 
 use crate::Error;
 use calibration::CameraRefinement;
@@ -37,13 +37,13 @@ pub struct CommonOptions {
     pub n_planned_steps: u64,
     /// Camera parameters that are optimized with the scene.
     pub cameras: CameraRefinement,
-    /// Camera parameters that are estimated by registering keyframes with depth, before the model is trained on them.
+    /// Camera parameters that alignment estimates by registering keyframes that have depth.
     pub align: CameraRefinement,
     /// When they are estimated.
     pub align_timing: AlignTiming,
 }
 
-/// Options of a model. `S` are those of its method, by default as JSON, because the type depends on the method.
+/// Options of a model. `S` is the type of the method-specific options; the default, JSON, holds those of any method.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ModelOptions<S = Value> {
@@ -67,7 +67,7 @@ impl Default for CommonOptions {
 }
 
 impl<S> ModelOptions<S> {
-    /// These options with a change.
+    /// Applies a change and returns the changed options.
     #[must_use]
     pub fn with(mut self, change: impl FnOnce(&mut Self)) -> Self {
         change(&mut self);
@@ -76,14 +76,14 @@ impl<S> ModelOptions<S> {
 }
 
 impl<S> From<S> for ModelOptions<S> {
-    /// Options of a method with the default common options.
+    /// Combines method-specific options with the default common options.
     fn from(specific: S) -> Self {
         Self { common: CommonOptions::default(), specific }
     }
 }
 
 impl ModelOptions {
-    /// The options with those of the method in their own type.
+    /// Converts the method-specific options from JSON to their own type.
     ///
     /// # Errors
     ///
@@ -96,7 +96,7 @@ impl ModelOptions {
 }
 
 impl<S: MethodOptions> ModelOptions<S> {
-    /// The options with those of the method as JSON.
+    /// Converts the method-specific options to JSON.
     pub fn to_json(&self) -> ModelOptions {
         ModelOptions { common: self.common.clone(), specific: json(&self.specific) }
     }
@@ -134,8 +134,8 @@ mod tests {
         let message = options.typed::<MeanColorOptions>().unwrap_err().to_string();
         assert!(message.contains("mean-color") && message.contains("fast"), "{message}");
         options.specific = serde_json::json!({ "rate": 0.5, "seed": 1 });
-        assert!(options.typed::<MeanColorOptions>().is_err(), "a common option among those of the method");
+        assert!(options.typed::<MeanColorOptions>().is_err(), "common options must be rejected");
         options.specific = serde_json::json!({});
-        assert!(options.typed::<MeanColorOptions>().is_err(), "no option may be missing");
+        assert!(options.typed::<MeanColorOptions>().is_err(), "missing options must be rejected");
     }
 }
