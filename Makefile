@@ -1,11 +1,11 @@
 # The same commands for developers and continuous integration; `make` without arguments lists them.
 #
-# As root, every target installs missing dependencies (system packages with apt, the pinned MuJoCo library, the page's npm packages)
-# and lists them; without root, it prints the one command that installs them.
+# As root, targets install missing dependencies (system packages with apt, the pinned MuJoCo library, the page's npm packages) and list
+# them. Without root, they print the command that installs the system packages.
 
 .DEFAULT_GOAL := help
 .PHONY: help demo test hil check fuzz deps web cargo packages test-packages check-packages mujoco realsense open-ends
-# Cargo and npm use all processors; two runs of apt would lock each other out.
+# Cargo and npm already use all processors, and two runs of apt would block each other.
 .NOTPARALLEL:
 
 # One feature set everywhere, so that dependencies compile once.
@@ -15,7 +15,7 @@ FEATURES := --features sim
 TEST_FEATURES = $(FEATURES),nokhwa$(shell [ -e .deps/realsense/made-of ] && \
 	scripts/install-packages.sh --check realsense 2>/dev/null && echo ,realsense)
 
-# The rig that `make demo` simulates: a file name in the folder rigs, without extension.
+# Rig that `make demo` simulates: name of a file in the folder rigs, without extension.
 RIG ?= static-arm
 # Duration of `make hil` in seconds.
 LISTEN_SECONDS ?= 20
@@ -30,11 +30,11 @@ demo: deps web ## Simulate a rig (RIG=static-arm, mobile-arm, mobile-base-small,
 test: test-packages check web ## Run lints, documentation and all tests that need no device
 	cargo test --workspace $(TEST_FEATURES) --no-fail-fast
 
-hil: cargo packages web ## Check the rig RIG=file.toml on the connected devices: reads all of them for LISTEN_SECONDS=20 and moves nothing
+hil: cargo packages web ## Check the devices of the rig RIG=file.toml: reads all of them for LISTEN_SECONDS=20 and moves nothing
 	cargo build --release $(shell pkg-config --exists realsense2 2>/dev/null && echo --features realsense)
-	target/release/fieldrig doctor $(if $(filter file,$(origin RIG)),$(error say which rig: make hil RIG=file.toml),$(RIG)) --listen $(LISTEN_SECONDS)
+	target/release/fieldrig doctor $(if $(filter file,$(origin RIG)),$(error RIG is not set; run: make hil RIG=file.toml),$(RIG)) --listen $(LISTEN_SECONDS)
 
-check: check-packages deps realsense open-ends ## Check format, clippy, documentation, kernels, licenses, open ends
+check: check-packages deps realsense open-ends ## Check format, clippy, documentation, kernels, licenses, to-do markers
 	cargo fmt --all --check
 	cargo clippy --workspace --all-targets $(TEST_FEATURES) -- -D warnings
 	cargo clippy --workspace --exclude sim --all-targets --no-default-features -- -D warnings
@@ -44,8 +44,8 @@ check: check-packages deps realsense open-ends ## Check format, clippy, document
 	@if cargo deny --version >/dev/null 2>&1; then \
 		cargo deny check licenses bans sources || exit 1; \
 		if cargo deny fetch db >/dev/null 2>&1; then cargo deny check advisories; \
-		else echo "cargo deny: advisories skipped, their database is unreachable"; fi; \
-	else echo "cargo deny: skipped, not installed (cargo install --locked cargo-deny)"; fi
+		else echo "cargo deny: advisories skipped, because their database is unreachable"; fi; \
+	else echo "cargo deny: skipped, because it is not installed (cargo install --locked cargo-deny)"; fi
 
 # Duration per fuzz target in seconds.
 SECONDS ?= 600
@@ -63,8 +63,8 @@ cargo:
 packages:
 	@scripts/install-packages.sh build gpu sim web
 
-# All groups in one call, so that without root there is one command to run. Tests whose packages cannot be installed are skipped with a
-# message, unless FIELDRIG_HIL=demand.
+# One call checks all groups, so that users without root get a single command to run. Tests whose packages cannot be installed are skipped
+# with a message, unless FIELDRIG_HIL=demand.
 OPTIONAL = $(if $(filter demand,$(FIELDRIG_HIL)),,--optional)
 test-packages: cargo
 	@scripts/install-packages.sh build gpu sim web nokhwa $(OPTIONAL) realsense hil
@@ -75,7 +75,7 @@ check-packages: cargo
 mujoco: packages
 	@scripts/fetch-mujoco.sh
 
-# If it is not available, tests that need it are skipped with a message, unless FIELDRIG_HIL=demand.
+# Without the library, tests of RealSense cameras are skipped with a message, unless FIELDRIG_HIL=demand.
 realsense: check-packages
 	@scripts/install-packages.sh --check realsense && scripts/fetch-realsense.sh || { [ "$$FIELDRIG_HIL" != demand ] && \
 	echo "skipped: tests of RealSense cameras"; }

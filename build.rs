@@ -1,5 +1,4 @@
-//! Tells the linker where the MuJoCo and RealSense libraries are, for binaries and tests with the features `sim` and
-//! `realsense`.
+//! Adds the paths of the MuJoCo and RealSense libraries to binaries and tests with the features `sim` and `realsense`.
 
 fn main() {
     println!("cargo::rerun-if-env-changed=MUJOCO_DYNAMIC_LINK_DIR");
@@ -17,7 +16,7 @@ fn main() {
     if std::env::var_os("CARGO_FEATURE_SIM").is_none() {
         return;
     }
-    // Next to the executable, in a checkout that was moved with its target folder, and in the build location.
+    // Next to the executable, and in the checkout, relative to binaries and tests, so that the checkout can be moved.
     for folder in ["$ORIGIN", "$ORIGIN/../../.deps/mujoco", "$ORIGIN/../../../.deps/mujoco"] {
         println!("cargo::rustc-link-arg=-Wl,-rpath,{folder}");
     }

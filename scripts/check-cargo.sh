@@ -17,12 +17,12 @@ if ! command -v cargo >/dev/null 2>&1; then
         echo "cargo is installed but not on the path; run this command, then try again:" >&2
         echo "    . \"${CARGO_HOME:-$HOME/.cargo}/env\"" >&2
     else
-        echo "cargo is missing; run this, then try again:" >&2
+        echo "cargo is missing; run this command, then try again:" >&2
         print_rustup
     fi
     exit 1
 fi
-# With rustup, this downloads the pinned toolchain if it is missing, and shows its messages.
+# With rustup, this downloads the pinned toolchain if it is missing. Its messages are shown.
 if ! found=$(cargo --version); then
     echo "cargo does not run; with rustup, run this command, then try again:" >&2
     echo "    rustup toolchain install $required --profile minimal --component clippy --component rustfmt" >&2
@@ -30,7 +30,7 @@ if ! found=$(cargo --version); then
 fi
 found=$(echo "$found" | cut -d ' ' -f 2)
 if [ "$(printf '%s\n' "$required" "${found%%-*}" | sort -V | head -n 1)" != "$required" ]; then
-    echo "$(command -v cargo) is version $found, but $required or newer is needed (Debian's package is older); run this, then try again:" >&2
+    echo "$(command -v cargo) is version $found, but $required or newer is needed (Debian's package is older); run this command, then try again:" >&2
     print_rustup
     exit 1
 fi

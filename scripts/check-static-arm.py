@@ -1,13 +1,13 @@
 #!/usr/bin/env python3
 """Checks whether a model of the simulated static arm reproduces details.
 
-usage: check-static-arm.py FIELDRIG MODEL NERFSTUDIO_FOLDER   (the folder: `fieldrig export REC.mcap --to nerfstudio`)
+usage: check-static-arm.py FIELDRIG MODEL NERFSTUDIO_FOLDER   (NERFSTUDIO_FOLDER: from `fieldrig export REC.mcap --to nerfstudio`)
 
 Renders every test view and prints one JSON object with
-- tags: number of tag36h11 codes that OpenCV detects in the true test images, and how many of those in the renders;
-- edges: distance of the wooden block's silhouette edges in rendered depth from the truth, millimeters, measured across
-  the edge in the plane of the adjacent face, at the point where depth crosses half of its jump; `ideal` is the same
-  measure for exact depth at the same pixels, that is, the error of the measurement.
+- tags: number of tag36h11 codes that OpenCV detects in the test images, in the renders, and in both;
+- edges: position errors of the wooden block's silhouette edges in rendered depth, millimeters. The edge is where depth
+  crosses half of its jump; the error is measured across the edge, in the plane of the adjacent face;
+- ideal: the same for exact depth at the same pixels, which shows the error of the measurement.
 
 Needs numpy and OpenCV with its aruco module. Geometry: sim/src/objects.rs.
 """
@@ -28,7 +28,7 @@ STEP_M, REACH_M, ALONG_M, MIN_JUMP_M = 0.00025, 0.008, 0.003, 0.01
 
 
 def layout(sources):
-    """The target's position, parsed from the simulator's source to avoid a copy."""
+    """Position of the target and height of the table, parsed from the simulator's source to avoid a copy."""
     import re
 
     text = (sources / "sim/src/objects.rs").read_text()
@@ -46,7 +46,7 @@ def world_from_block():
 
 
 def exact_depth(camera, world_from_camera, px):
-    """Depth of block or table along z at pixels [n, 2]."""
+    """Depth along z of the block or table at pixels [n, 2]."""
     rays = np.c_[(px - camera["c"]) / camera["f"], np.ones(len(px))] @ world_from_camera[:3, :3].T
     eye = world_from_camera[:3, 3]
     table = (TABLE_Z - eye[2]) / rays[:, 2]
@@ -59,7 +59,7 @@ def exact_depth(camera, world_from_camera, px):
 
 
 def sample(depth, px):
-    """Bilinear, pixel centers at + 0.5; NaN outside."""
+    """Bilinear interpolation; pixel centers at + 0.5, NaN outside."""
     at = px - 0.5
     x, y = np.floor(at).astype(int).T
     inside = (x >= 0) & (y >= 0) & (x + 1 < depth.shape[1]) & (y + 1 < depth.shape[0])

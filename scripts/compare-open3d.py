@@ -4,21 +4,22 @@
 usage: compare-open3d.py surfaces DATA MODEL OUT_FOLDER   (MODEL: the folder of `fieldrig train DATA --method tsdf --refine none`)
        compare-open3d.py frame                            (compare with `cargo bench -p trainer --bench tsdf`)
 
-`surfaces` fuses, on the CPU, the images of a nerfstudio folder that MODEL/keyframes.txt lists, with the same poses, lens, depth
-range, voxels and truncation as fieldrig (those of MODEL/model.json), and compares Open3D's mesh with MODEL/mesh.ply:
+`surfaces` fuses on the CPU the images of a nerfstudio folder that MODEL/keyframes.txt lists. Poses and lens are the same as for fieldrig;
+depth range, voxel size and truncation are from MODEL/model.json. The script compares Open3D's mesh with MODEL/mesh.ply:
 - fusing: milliseconds per image with color, the median after the first pass over all images, excluding image decoding;
-- mesh (of all observed voxels; `mesh_default_threshold`: of those observed more than three times, Open3D's default): triangles, area,
-  boundary edges (number, length and loops), connected components. Vertices closer than 10 um are merged first, because neither program
-  guarantees that blocks share vertices;
-- against_depth: measured depth of test images, which neither program has fused, against the depth of the mesh: fraction of measured
-  pixels with a surface, fraction with one within two voxels (along z), and the median error;
+- mesh: triangles, area, boundary edges (number, length and loops) and connected components of the mesh of all observed voxels.
+  `mesh_default_threshold` uses voxels observed more than three times, Open3D's default. Vertices closer than 10 um are merged first,
+  because neither program guarantees that blocks share vertices;
+- against_depth: depth rendered from the mesh, compared with measured depth of test images, which neither program has fused: fraction of
+  measured pixels with a surface, fraction with a surface within two voxels along z, and median error;
 - distances of uniform samples on each mesh from the other mesh;
 - renders of both meshes next to the photo, from the poses of test images, in OUT_FOLDER.
 
-`frame` fuses the exact images of fieldrig's benchmark `tsdf` with voxels of 1 cm: 8 images, then the time of 4 more, then of all 12 again, for the three block sizes and number formats that Open3D supports.
+`frame` fuses the exact images of fieldrig's benchmark `tsdf` with voxels of 1 cm, for two block sizes and two number formats. It fuses
+8 images, then times 4 more, then times all 12 again.
 
 Prints one JSON object. Needs open3d 0.20 (pip), numpy, scipy, pillow. To limit both programs to the same cores, run both with
-`taskset -c 0,1` and this one with OMP_NUM_THREADS=2.
+`taskset -c 0,1`, and this script also with OMP_NUM_THREADS=2.
 """
 
 import argparse
@@ -45,21 +46,21 @@ OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 class Frame:
-    """Depth in meters, color, and camera pose; pixel centers of `principal` at + 0.5, as in fieldrig's files."""
+    """Depth in meters, color, lens and camera pose. Pixel centers are at + 0.5, as in fieldrig's files."""
 
     def __init__(self, name, depth_m, rgb, focal, principal, world_from_camera):
         self.name, self.depth_m, self.rgb = name, depth_m, rgb
         self.focal, self.principal, self.world_from_camera = focal, principal, world_from_camera
         self.depth_image = o3d.t.geometry.Image(o3c.Tensor(np.ascontiguousarray(depth_m, np.float32)))
         self.color_image = o3d.t.geometry.Image(o3c.Tensor(rgb.astype(np.float32) / 255.0))
-        # Open3D's pixel centers are whole numbers.
+        # In Open3D, pixel centers are at integers.
         lens = [[focal[0], 0, principal[0] - 0.5], [0, focal[1], principal[1] - 0.5], [0, 0, 1]]
         self.lens = o3c.Tensor(np.array(lens))
         self.camera_from_world = o3c.Tensor(np.linalg.inv(world_from_camera))
 
 
 class Grid:
-    """Open3D's field, fused as its own example does (examples/python/t_reconstruction_system/integrate.py)."""
+    """Open3D's distance field, fused as in Open3D's examples/python/t_reconstruction_system/integrate.py."""
 
     def __init__(self, voxel_m, truncation_voxels, depth_max_m, block=16, numbers=o3c.float32, n_blocks=40_000):
         self.truncation_voxels, self.depth_max_m = truncation_voxels, depth_max_m
@@ -84,7 +85,7 @@ class Grid:
 
 
 class Mesh:
-    """Triangles in world, meters; colors of vertices 0 to 1."""
+    """Triangles in the world frame, meters; vertex colors from 0 to 1."""
 
     def __init__(self, places, triangles, colors):
         self.places, self.triangles, self.colors = places.astype(np.float64), triangles.astype(np.int64), colors
@@ -180,7 +181,7 @@ def against_depth(mesh, frames, voxel_m, depth_max_m):
 
 
 def frames_of(data, keyframes):
-    """Frames of a nerfstudio folder by split, as listed: photo n of the folder, in order of names, has the stamp n ms."""
+    """Training and test frames that the list names. Its stamps are indices: photo n, in order of names, has the stamp n ms."""
     summary = json.loads((data / "transforms.json").read_text())
     existing = sorted((f for f in summary["frames"] if (data / f["file_path"]).exists()), key=lambda f: f["file_path"])
     by_split = {"train": [], "validation": [], "test": []}
@@ -216,7 +217,7 @@ def surfaces(args):
             grid.fuse(frame)
         theirs = grid.mesh(0.0)
         summary["open3d"]["mesh"], summary["open3d"]["mesh_default_threshold"] = theirs.summary(), grid.mesh(3.0).summary()
-        summary["open3d"][f"fusing_blocks_of_{block}"] = timing([grid.fuse(frame) for frame in frames])  # Warm, with all blocks allocated.
+        summary["open3d"][f"fusing_blocks_of_{block}"] = timing([grid.fuse(frame) for frame in frames])  # All blocks are allocated already.
     ours = Mesh.read(args.model / "mesh.ply")
     summary["fieldrig"] = {"mesh": ours.summary()}
     summary["voxel_mm"], summary["truncation_voxels"], summary["frames"] = 1e3 * voxel_m, truncation_voxels, len(frames)

@@ -1,9 +1,8 @@
 #!/usr/bin/env bash
-# Fuzzes the parsers of all wire and file formats: fuzz.sh SECONDS [TARGET...]; all targets if none is named.
+# Fuzzes the parsers of wire and file formats. Usage: fuzz.sh SECONDS [TARGET...]; without TARGET, all of them.
 #
-# Runs the targets one after the other, SECONDS each. Needs a nightly compiler and cargo-fuzz. Crashes are saved in
-# fuzz/artifacts: fix the bug, and add the smallest input that triggers it to fuzz/seeds. The corpus stays in
-# fuzz/corpus for the next run.
+# Runs the targets one after the other, for SECONDS each. Needs a nightly compiler and cargo-fuzz. Crashes are saved in fuzz/artifacts: fix
+# the bug, and add the smallest input that triggers it to fuzz/seeds. The corpus stays in fuzz/corpus for the next run.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 seconds=$1

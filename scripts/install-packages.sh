@@ -1,20 +1,20 @@
 #!/bin/sh
-# Installs missing system packages with apt, and nothing else; prints which packages and why.
-# Without root it prints the command to run and fails. If nothing is missing, it does nothing and prints nothing.
-# For Debian 12, Debian 13 and Ubuntu 24.04. scripts/test-install.sh runs it on systems with no packages or only some of them.
+# Installs missing system packages with apt, and nothing else. Prints which packages it installs and why. Without root it prints the command
+# to run and fails. If nothing is missing, it does nothing and prints nothing. For Debian 12, Debian 13 and Ubuntu 24.04.
+# scripts/test-install.sh tests it on systems that lack all or some of the packages.
 #
-# Each check looks for what a build or a program uses (a header, a library for this processor, a command that runs), not
-# for the name of a package: a partly installed package, another version or another source of the same thing is recognized.
+# Each check looks for the file or command that a build or program uses (a header, a library for this processor, a command that runs), not
+# for a package name. This detects incomplete packages and accepts software from other sources.
 #
 # usage: install-packages.sh [--check] GROUP... [--optional GROUP...]      groups: build gpu sim web nokhwa realsense hil
 #   --check       print what is missing and fail; install nothing
-#   --optional    if packages of the groups after it cannot be installed, print a message and succeed
+#   --optional    the groups after it are optional: if their packages cannot be installed, print a message and succeed
 set -eu
 
 PATH="$PATH:/usr/sbin:/sbin"
 export PATH
 
-# What is missing: package names, and one line of text for each. `required` counts the packages that are not optional.
+# Names of the missing packages, one line of text for each, and the number of missing packages that are not optional.
 missing=""
 reasons=""
 required=0
@@ -54,7 +54,7 @@ elf_machine() {
     od -An -tx1 -j18 -N2 "$1"
 }
 
-# is_native FILE: whether programs of this system can load a library; a 32-bit library is often installed next to the right one.
+# is_native FILE: whether programs of this system can load a library. Often, a 32-bit library is also installed.
 is_native() {
     [ -r "$1" ] && [ "$(elf_machine "$1")" = "$(elf_machine /bin/sh)" ]
 }
@@ -82,8 +82,8 @@ links() {
     return $status
 }
 
-# need_header HEADER LIBRARY PACKAGE REASON: adds the package unless programs can be linked with the library. A library
-# without its -dev package has neither the header nor the name that the linker looks for.
+# need_header HEADER LIBRARY PACKAGE REASON: adds the package unless programs can be linked with the library. Without the -dev package, the
+# header and the file name that the linker looks for are missing.
 need_header() {
     if links 'int main(void) { return 0; }\n'; then
         links "#include <$1>\nint main(void) { return 0; }\n" "-l$2" || need "$3" "$4"
@@ -110,13 +110,13 @@ python_has() {
     python3 -c "$1" >/dev/null 2>&1
 }
 
-# need_pip REASON: needs a pip that knows the platforms of the wheels (manylinux_2_28, since pip 20.3), and the modules that open wheels.
+# need_pip REASON: adds pip unless it supports the platform of the wheels (manylinux_2_28, since pip 20.3) and Python can unpack wheels.
 need_pip() {
     python_has 'import pip, ssl, sys, zipfile; sys.exit(int(pip.__version__.split(".")[0]) < 21)' || need python3-pip "$1"
 }
 
-# libclang_files: prints candidates for libclang in the order of the crate clang-sys: only those in LIBCLANG_PATH if that is set;
-# otherwise llvm-config's folder, the linker's paths, and the system's folders.
+# libclang_files: prints candidates for libclang in the order of the crate clang-sys. If LIBCLANG_PATH is set, it is the only folder;
+# otherwise the folders are those of llvm-config, of the linker and of the system.
 libclang_files() {
     if [ -f "${LIBCLANG_PATH-}" ]; then
         echo "$LIBCLANG_PATH"
@@ -153,7 +153,7 @@ libclangs() {
     done
 }
 
-# check_libclang: checks what the crate bindgen needs: libclang, and the headers of the same clang (stddef.h and others).
+# check_libclang: checks for the files that the crate bindgen needs: libclang, and the headers of the same clang (stddef.h and others).
 check_libclang() {
     # clang-sys takes the highest version; among equal versions, the first folder wins.
     chosen=$(libclangs | sort -s -t ' ' -k 1,1Vr | head -n 1)
@@ -180,7 +180,7 @@ check_libclang() {
 check() {
     case "$1" in
     build)
-        # A C compiler is useless without its headers and start files, which gcc only recommends.
+        # A C compiler needs headers and start files, but the package gcc only recommends them.
         if ! links '#include <stdio.h>\n#include <linux/videodev2.h>\nint main(void) { return puts(""); }\n'; then
             if echo 'int nothing;' | cc -x c -c -o /dev/null - >/dev/null 2>&1; then
                 need libc6-dev "headers and start files of the C library"
@@ -208,7 +208,7 @@ check() {
         [ "${npm_major:-0}" -ge 7 ] || need npm "downloads the libraries of the web page (npm 7 or newer)"
         ;;
     nokhwa)
-        # Only Linux needs it: nokhwa's V4L2 bindings are generated in each build.
+        # Needed only on Linux, where every build generates nokhwa's V4L2 bindings.
         check_libclang
         ;;
     realsense)
@@ -258,7 +258,7 @@ check_all() {
     done
 }
 
-# give_up: exits before everything is installed; this is a failure unless only packages of optional groups are missing.
+# give_up: exits because packages are missing. This is a failure unless all of them are optional.
 give_up() {
     if [ "$required" -eq 0 ]; then
         echo "continuing without them: the tests that use them are skipped" >&2
@@ -277,7 +277,7 @@ check_all
 case " $groups " in
 *" hil "*)
     hil_is_supported || $only_check ||
-        echo "skipping the tests in virtual kernels: these are built from the source of Debian 12's kernel, on x86-64 only" >&2
+        echo "skipping the tests in virtual kernels: they require Debian 12 on x86-64" >&2
     ;;
 esac
 if [ -z "$missing" ]; then
@@ -291,9 +291,9 @@ if ! command -v apt-get >/dev/null 2>&1; then
     echo "apt-get not found: install the equivalents of these Debian packages with the package manager of this system" >&2
     give_up
 fi
-# Wait if another apt holds the lock.
+# If another apt holds the lock, wait for it.
 install="apt-get install -y -q --no-install-recommends -o DPkg::Lock::Timeout=300"
-# An unreachable repository does not stop the installation.
+# After `;`, the installation continues even if a repository is unreachable.
 line="apt-get update -q; $install$missing"
 # An interrupted installation must be finished first, together with its dependencies.
 if [ -n "$(dpkg --audit 2>/dev/null)" ]; then
@@ -312,7 +312,7 @@ echo "installing:$missing" >&2
 export DEBIAN_FRONTEND=noninteractive
 requested=$missing
 if ! sh -c "$line" >&2; then
-    echo "apt-get did not install all of$requested; its message is above" >&2
+    echo "apt-get could not install all of$requested; see its message above" >&2
     give_up
 fi
 hash -r

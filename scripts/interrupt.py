@@ -4,14 +4,14 @@
     scripts/interrupt.py target/release/fieldrig FOLDER CASE train|run|record [-n 20] [--seed 1] [--method splat] [--no-hangup]
 
 CASE is one of
-    close   the terminal closes at a random moment; with --no-hangup without a SIGHUP, as after a broken connection
+    close   the terminal closes at a random moment; with --no-hangup, no SIGHUP is sent, as after a broken connection
     head    the reader of stdout closes the pipe after one line
     full    stdout and stderr are /dev/full
     disk    the output folder is a tmpfs of 6 MB (needs root)
     kill    train or run: SIGKILL at a random moment after the first checkpoint; the run is then resumed without flags. Training must
-            end with the hash of an uninterrupted one, a live run must keep its keyframes
+            end with the hash of an uninterrupted run, and a live run must keep its keyframes
 
-A trial passes if its recording can be read and its model, or a checkpoint, can be loaded. FOLDER keeps the files of trials that fail.
+A trial passes if its recording can be read and its model, or a checkpoint, can be loaded. Files of failed trials are kept in FOLDER.
 """
 
 import argparse
@@ -31,9 +31,9 @@ from pathlib import Path
 PATIENCE_SECS = 300
 # Limits with which a model trains within seconds even without a GPU.
 SMALL = ["--max-splats", "2000"]
-# Files of a saved model covered by its hash, in this order.
+# Files that the hash of a saved model covers, in this order.
 MODEL_FILES = ["model.json", "splats.ply", "mesh.ply", "mesh.glb", "field.blocks", "field.nerf"]
-# What each command prints once it has its first keyframe or image.
+# Text that each command prints with its first keyframe or image.
 FIRST_WORDS = {"train": b"step", "run": b"step", "record": b"color images"}
 
 
@@ -55,7 +55,7 @@ class Trial:
             made.mkdir(parents=True)
 
     def fieldrig(self, *args, codes=(0,)):
-        """Runs a command that has to succeed; returns the finished process."""
+        """Runs a command that must exit with one of `codes`. Returns the finished process."""
         done = subprocess.run([self.exe, *map(str, args)], capture_output=True, text=True, timeout=PATIENCE_SECS)
         expect(done.returncode in codes, f"{' '.join(map(str, args))}: {done.stderr[-1500:]}")
         return done
@@ -75,7 +75,7 @@ class Trial:
         return subprocess.Popen(command, stdin=subprocess.DEVNULL, env=environment, **streams)
 
     def check(self):
-        """Reads the files that the command left."""
+        """Checks that the files written by the command can be read. Returns a summary."""
         if self.args.command != "train":
             recording = self.check_recording()
         if self.args.command == "record":
@@ -90,7 +90,7 @@ class Trial:
         return "training resumes from the checkpoint"
 
     def check_recording(self):
-        """Reads the recording; if the disk was full, the number of samples must match the number that the command reported."""
+        """Checks that the recording can be read and, after a full disk, has as many samples as the command reported."""
         recording = self.out / "run.mcap"
         output = self.folder / "output.txt"
         printed = output.read_text() if output.exists() else ""
@@ -125,7 +125,7 @@ class Trial:
                 close_at = time.monotonic() + wait_secs
         os.close(ours)
         closed = time.monotonic()
-        if self.args.no_hangup:  # Otherwise it would run for the full minute.
+        if self.args.no_hangup:  # Without SIGHUP, the command would run for the full minute.
             time.sleep(3.0)
             expect(process.poll() is None, "the process ended when its terminal closed")
             process.send_signal(signal.SIGINT)
@@ -150,7 +150,7 @@ class Trial:
 
     def disk(self):
         subprocess.run(["mount", "-t", "tmpfs", "-o", "size=6m", "tmpfs", self.out], check=True)
-        # From empty to almost full, so that writing fails at a different file in each trial.
+        # Fill a random part of the disk, so that writing fails at a different file in each trial.
         (self.out / "filler").write_bytes(bytes(self.random.randrange(6 << 20)))
         command = self.command(10)
         process = self.start(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
@@ -163,7 +163,7 @@ class Trial:
         return self.kill_train() if self.args.command == "train" else self.kill_run()
 
     def kill_after_checkpoint(self, process, ends_after_secs):
-        """Kills a run at a random moment between its first checkpoint and its end; returns that moment, and whether it was running."""
+        """Kills a run at a random moment after its first checkpoint. Returns that moment, and whether the run was still running."""
         begun = time.monotonic()
         while not (self.out / "model/training.ckpt").exists():
             expect(process.poll() is None, "the process ended before its first checkpoint")
@@ -194,7 +194,7 @@ class Trial:
         return f"killed {wait_secs:.1f} s after the first checkpoint" if was_killed else "killed after its end"
 
     def sha256_of_model(self):
-        """As in report.json, which a run that is killed while it scores its model does not write."""
+        """The hash as in report.json, which is missing if the run was killed while it scored its model."""
         sha256 = hashlib.sha256()
         for file in [self.out / "model" / name for name in MODEL_FILES]:
             if file.exists():
@@ -227,7 +227,7 @@ class Trial:
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("fieldrig", help="path of the fieldrig binary")
-    parser.add_argument("folder", help="folder for the training data, which is created if missing, and for the trials")
+    parser.add_argument("folder", help="folder for the trials and their training data, which is recorded if missing")
     parser.add_argument("case", choices=["close", "head", "full", "disk", "kill"])
     parser.add_argument("command", choices=["train", "run", "record"])
     parser.add_argument("-n", type=int, default=20, help="trials (default 20)")
@@ -239,13 +239,13 @@ def main():
     parser.add_argument("--steps", type=int, default=300, help="for kill")
     args = parser.parse_args()
     if args.case == "kill" and args.command == "record":
-        parser.error("the case kill requires the command train")
+        parser.error("the case kill requires the command train or run")
     data = Path(args.folder).resolve() / "data.mcap"
     data.parent.mkdir(parents=True, exist_ok=True)
     if not data.exists():
         record = [args.fieldrig, "record", args.rig, "--sim", "--seconds", "6", "--out", data]
         code = subprocess.run(record, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL).returncode
-        expect(code in (0, 3), f"record ended with exit code {code}")  # A slow computer may skip images.
+        expect(code in (0, 3), f"record ended with exit code {code}")  # Exit code 3: a slow computer may drop images.
     n_passed = 0
     for n in range(args.n):
         trial = Trial(args, n)

@@ -3,8 +3,8 @@
 
     scripts/load-server.py 127.0.0.1:7007
 
-Opens 2000 half-open requests, 500 WebSockets that never send a message, and 32 that never read. Then opens the page and a WebSocket as a
-browser does and requests a picture, ten times. Exits with 1 if a viewer waits more than a second for its connection.
+Opens 2000 connections with an incomplete request, 500 WebSockets that never send a message, and 32 that never read. Then connects ten
+times like a browser: opens the page and a WebSocket, and requests a picture. Exits with 1 if a viewer waits more than a second to connect.
 """
 
 import argparse
@@ -61,7 +61,7 @@ def read_exactly(stream, n):
 
 
 def read_frame(stream):
-    """Opcode and payload of the next WebSocket frame."""
+    """Returns opcode and payload of the next WebSocket frame."""
     first, length = read_exactly(stream, 2)
     if length == 126:
         (length,) = struct.unpack("!H", read_exactly(stream, 2))
@@ -71,7 +71,7 @@ def read_frame(stream):
 
 
 def view(address):
-    """Seconds until the page and `hello` arrive, and until a picture or its error arrives."""
+    """Connects like a browser. Returns the WebSocket, and the seconds until `hello` and until a picture or an error."""
     begun = time.monotonic()
     page = connect(address)
     page.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n")
@@ -140,7 +140,7 @@ def main():
         pictures.append(answered)
         time.sleep(0.3)
     print(f"new viewers connected within {max(waits) * 1e3:.0f} ms")
-    print(f"their first picture arrived within {max(pictures) * 1e3:.0f} ms")
+    print(f"first pictures arrived within {max(pictures) * 1e3:.0f} ms")
     if max(waits) > MAX_WAIT_SECS:
         sys.exit(f"a new viewer waited {max(waits):.2f} s, longer than {MAX_WAIT_SECS} s")
 

@@ -1,13 +1,12 @@
 #!/bin/sh
-# Tests the installation scripts in Debian systems with no packages or only some of them: chroots made with
-# debootstrap.
+# Tests the installation scripts in debootstrap chroots of Debian that lack all or some of the packages.
 #
-# For each state, the script makes such a system and checks: install-packages.sh --check names exactly the missing packages; without
-# root, install-packages.sh prints one command to run and fails; as root it installs them; a second run prints nothing; and the installed
-# packages work: a C program is linked, Vulkan and EGL are opened, bindings are generated, the page is bundled.
+# For each state, the script sets up a chroot and checks install-packages.sh: with --check, it names exactly the missing packages; without
+# root, it prints one command to run and fails; as root, it installs the packages; a second run prints nothing. Then the script uses the
+# installed packages: it links a C program, opens Vulkan and EGL, generates bindings, and bundles the page.
 #
-# Needs root, debootstrap, network, and 4 GB in FOLDER; much faster if FOLDER is in memory, such as /dev/shm/test-install.
-# Not part of `make test`.
+# Needs root, debootstrap, network, and 4 GB in FOLDER. It is much faster if FOLDER is in memory, such as /dev/shm/test-install. Not part of
+# `make test`.
 #
 # usage: test-install.sh [bookworm|trixie]... [STATE]...      default: both systems and all states
 #   FOLDER=/tmp/test-install   folder for chroots and downloaded packages; kept for the next run
@@ -72,14 +71,14 @@ make_base() {
     fi
 }
 
-# make_root: makes a copy of the minimal system in which scripts can run, with the checkout in /src.
+# make_root: copies the minimal system and prepares it for running scripts, with the checkout in /src.
 make_root() {
     discard
     cp -a --reflink=auto "$base" "$root"
     cp /etc/resolv.conf "$root/etc/resolv.conf"
     [ -z "${FILES-}" ] || cp -a "$FILES/." "$root/"
     mkdir -p "$root/src" "$root/var/cache/apt/archives"
-    # Thousands of temporary files do not need to reach the disk.
+    # Packages do not need to be synced to the disk, because the chroot is temporary.
     echo force-unsafe-io >"$root/etc/dpkg/dpkg.cfg.d/unsafe-io"
     git ls-files -z -co --exclude-standard | tar --create --null --ignore-failed-read --files-from=- 2>/dev/null |
         tar --extract --directory "$root/src" --no-same-owner
@@ -88,7 +87,7 @@ make_root() {
     mount --bind "$folder/$suite-debs" "$root/var/cache/apt/archives"
 }
 
-# inside COMMANDS: runs them in /src of the chroot as root, or as the user named in $user.
+# inside COMMANDS: runs COMMANDS in /src of the chroot, as root or as the user named in $user.
 user=root
 inside() {
     set -- "cd /src; $1"
@@ -114,9 +113,9 @@ fail() {
     problems=$((problems + 1))
 }
 
-# state NAME GROUPS PACKAGES: tests a system that the commands on stdin set up: groups to install, and packages expected to be missing.
-# Variables: `unusable=true` if another program hides what is installed; `run_line=true` runs the command that is printed without root
-# instead of the script; `environment` holds environment variables for the script.
+# state NAME GROUPS PACKAGES: sets up a system with the commands on stdin, then installs GROUPS. PACKAGES are those expected to be missing.
+# Variables: `unusable=true`: another program hides an installed one; `run_line=true`: instead of running the script as root, run the
+# command that it prints without root; `environment`: environment variables for the script.
 state() {
     name=$1 groups=$2 expected=$3
     equipment=$(cat)
@@ -188,7 +187,8 @@ cargo_state() {
     problems=0
     make_root
     required=$(sed -n 's/^channel = "\(.*\)"$/\1/p' rust-toolchain.toml)
-    # prints EXPECTED COMMANDS: what check-cargo.sh must print (a pattern) when it fails after these commands; empty if it must pass.
+    # prints EXPECTED COMMANDS: runs COMMANDS, then check-cargo.sh. It must fail and print the pattern EXPECTED, or pass if EXPECTED is
+    # empty.
     prints() {
         status=0
         inside "$2; scripts/check-cargo.sh" >"$folder/out" 2>&1 || status=$?
@@ -215,7 +215,7 @@ cargo_state() {
     finish
 }
 
-# The commands below use what a group installed.
+# The functions below use the packages that a group installed.
 
 # use_c NAME: links and runs the program on stdin, if the group build was installed too.
 use_c() {
@@ -316,7 +316,7 @@ use_hil() {
         qemu-system-x86_64 --version && ip -V && busybox true' >>"$log" 2>&1 || fail "the tools of the group hil do not run, see $log"
 }
 
-# Begins the commands that install packages in a state.
+# Start of the command that installs packages when a state is set up.
 install="apt-get update -q; apt-get install -y -q --no-install-recommends"
 
 for suite in ${suites:-bookworm trixie}; do
@@ -355,7 +355,7 @@ EQUIP
     state vulkan-loader-only "build gpu" mesa-vulkan-drivers <<EQUIP
         $install $build libvulkan1
 EQUIP
-    # 32-bit programs bring libraries of the same names.
+    # 32-bit libraries have the same names.
     state libraries-of-another-processor "build gpu sim" "$(sorted "$gpu" "$sim")" <<EQUIP
         dpkg --add-architecture i386
         $install $build libvulkan1:i386 mesa-vulkan-drivers:i386 libegl1:i386 libegl-mesa0:i386 libgl1-mesa-dri:i386
@@ -369,7 +369,7 @@ EQUIP
     state python-without-pip-or-venv "sim hil" "$(sorted "$sim" "$hil")" <<EQUIP
         $install python3
 EQUIP
-    # An LLVM installation: libclang-cpp.so is there, libclang.so is not.
+    # An LLVM installation with libclang-cpp.so, but without libclang.so.
     state llvm-without-libclang "nokhwa" libclang-dev <<EQUIP
         $install llvm-$llvm-dev
         ls /usr/lib/llvm-$llvm/lib/libclang-cpp*.so*
@@ -386,7 +386,7 @@ EQUIP
 EQUIP
     environment=""
     if [ "$suite" = bookworm ]; then
-        # clang-sys takes the newest one, which has no headers.
+        # clang-sys takes the newest version, whose headers are missing.
         state newer-libclang-without-its-headers "nokhwa" libclang-common-16-dev <<EQUIP
             $install libclang-dev libclang1-16
 EQUIP

@@ -6,7 +6,7 @@ fn main() {
     if let Ok(folder) = std::env::var("MUJOCO_DYNAMIC_LINK_DIR") {
         println!("cargo::rustc-link-arg=-Wl,-rpath,{folder}");
     }
-    // If drivers are built with RealSense support, their library is linked here, too.
+    // If `drivers` is built with RealSense support, this crate's tests link librealsense2, too.
     if let Ok(folder) = std::env::var("PKG_CONFIG_PATH") {
         println!("cargo::rustc-link-arg=-Wl,-rpath,{folder}");
     }

@@ -1,18 +1,18 @@
 //! Settings of the C library's allocator.
 //!
-//! glibc serves large blocks from separate memory mappings, which return to the system when the blocks are freed. Each
-//! such free, however, raises the size above which glibc maps blocks, up to 32 MiB. Images then share heaps with
-//! everything else. In a long run the heaps fragment and grow although no more memory is in use: keyframes are freed,
-//! but smaller blocks between them remain. A fixed threshold keeps images out of the heaps.
+//! glibc serves large blocks from separate memory mappings, which return to the system when the blocks are freed.
+//! However, each such free raises the size above which glibc maps blocks, up to 32 MiB. Images are then allocated on
+//! the heaps, together with small blocks. In a long run, the heaps fragment and grow although memory use is constant,
+//! because small blocks remain between freed keyframes. A fixed threshold keeps images out of the heaps.
 //!
 //! The cost: the kernel clears a mapped block page by page when it is first written. Pictures for viewers are such
-//! blocks, and on a GPU that draws a picture in a millisecond, the clearing takes most of the time (H200, 1024x1024
-//! with depth, 8 clients: 105 ms from request to picture instead of 45). The setting is therefore for software
-//! adapters, where drawing takes far longer and images occupy host memory twice.
+//! blocks. On a GPU that draws a picture in a millisecond, clearing takes most of the time (H200, 1024x1024 with depth,
+//! 8 clients: 105 ms from request to picture instead of 45). The setting is therefore used only with software adapters,
+//! where drawing takes far longer and host memory holds images twice.
 
 /// Blocks of at least this size get a separate mapping. An image of 640x480 takes 1.2 MB.
 const MMAP_THRESHOLD_BYTES: i32 = 1 << 20;
-/// Free memory at the end of a heap above which it returns to the system: twice [`MMAP_THRESHOLD_BYTES`], as in glibc.
+/// Free memory at the end of a heap returns to the system above this size: twice [`MMAP_THRESHOLD_BYTES`], as in glibc.
 const TRIM_THRESHOLD_BYTES: i32 = 2 * MMAP_THRESHOLD_BYTES;
 
 /// Keeps large blocks out of the heaps, unless the environment sets the allocator's thresholds.
@@ -47,7 +47,7 @@ mod tests {
     const N_BLOCKS: usize = 64;
     const BLOCK_BYTES: usize = 16 << 20;
 
-    /// Bytes of blocks with separate mappings.
+    /// Total size of the blocks with separate mappings.
     fn mapped_bytes() -> usize {
         #[expect(unsafe_code, reason = "the allocator has no other interface")]
         // SAFETY: `mallinfo2` only reads the allocator's counters, under its lock.
@@ -62,7 +62,7 @@ mod tests {
         drop(vec![1u8; 24 << 20]);
         let before = mapped_bytes();
         // These blocks are zeroed and never written, so they take address space but no memory. Together they are far
-        // larger than what other tests running in parallel may free meanwhile.
+        // larger than any memory that parallel tests may free.
         let images: Vec<Vec<u8>> = (0..N_BLOCKS).map(|_| vec![0; BLOCK_BYTES]).collect();
         let grown = mapped_bytes().saturating_sub(before);
         assert!(grown >= N_BLOCKS / 2 * BLOCK_BYTES, "{grown} bytes of {} are mapped", images.len() * BLOCK_BYTES);

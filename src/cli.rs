@@ -16,7 +16,7 @@ use clap::{ArgAction, Parser, Subcommand};
     after_help = "Results go to stdout; the log and progress bars go to stderr.\n\
                   Exit codes: 0 done, 1 failed, 2 bad arguments, 3 done with loss, 4 insufficient data.\n\
                   A loss is input data that is missing from the result: images that devices dropped or that cannot be decoded, \
-                  or a truncated recording. Each loss is printed on stderr and, by train and run, listed in report.json. \
+                  or a truncated recording. Each loss is printed on stderr; train and run also list it in report.json. \
                   Output lines that could not be written count as losses, too."
 )]
 pub(crate) struct Cli {
@@ -56,7 +56,7 @@ pub(crate) enum Command {
     Doctor(doctor::Args),
     /// Emulate the devices of a rig: Franka, CAN motors, UDP, cameras
     Sim(sim::Args),
-    /// Move an arm to joint positions, within its limits, supervised
+    /// Move an arm to joint positions, within its limits and under supervision
     Move(move_arm::Args),
 }
 

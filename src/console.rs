@@ -17,7 +17,7 @@ pub(crate) enum OutputMode {
     Json,
     /// Only the progress bar; the caller reports the result.
     Bar,
-    /// Nothing at all.
+    /// Nothing.
     Nothing,
 }
 
@@ -99,7 +99,7 @@ pub(crate) fn print_json(value: &impl Serialize) {
     }
 }
 
-/// Prints the commands that use these models.
+/// Prints commands to run next on these models.
 pub(crate) fn print_next_commands(models: &[FinishedModel]) {
     let models: Vec<SavedModel<'_>> = models.iter().map(FinishedModel::saved).collect();
     for line in next_commands::lines(&next_commands::for_models(&models)) {
@@ -116,7 +116,7 @@ fn whole_secs(secs: f64) -> u64 {
 /// A progress bar for reading images; cleared when it is dropped.
 pub(crate) struct ReadBar {
     is_hidden: bool,
-    /// What is counted, and its bar.
+    /// Name of the counted items, and the bar.
     bar: Mutex<Option<(&'static str, ProgressBar)>>,
 }
 

@@ -19,7 +19,7 @@ pub(crate) struct DataArgs {
     rig: Option<PathBuf>,
     /// Scale the images (not their depth) to this fraction of their width and height, 0.05 to 1 [default: the rig
     /// file's, else 1]
-    #[arg(long, value_name = "SHARE", value_parser = downscale::parse_scale)]
+    #[arg(long, value_name = "FRACTION", value_parser = downscale::parse_scale)]
     scale: Option<f64>,
 }
 

@@ -74,7 +74,7 @@ fn class_of(error: &(dyn std::error::Error + 'static)) -> Option<ErrorClass> {
     of_session().or_else(of_capture).or_else(of_keyframe)
 }
 
-/// Whether a command was rejected: because of bad arguments, or because the data is insufficient.
+/// Whether a command was rejected because of bad arguments or insufficient data.
 pub(crate) fn is_rejection(error: &anyhow::Error) -> bool {
     matches!(of(error), Exit::BadArguments | Exit::InsufficientData)
 }
@@ -87,7 +87,7 @@ pub(crate) fn from_losses(data_losses: &[String]) -> Exit {
     if data_losses.is_empty() { Exit::Done } else { Exit::Loss }
 }
 
-/// Whether the reader of our output closed the pipe, as `head` does. This ends a command whose result is its output.
+/// Whether the reader of stdout closed the pipe, as `head` does. This ends a command whose result is its output.
 pub(crate) fn is_broken_pipe(error: &anyhow::Error) -> bool {
     let is_pipe = |io: &std::io::Error| io.kind() == ErrorKind::BrokenPipe;
     error.downcast_ref::<crate::print::StdoutError>().is_some_and(|error| is_pipe(&error.0))

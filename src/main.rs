@@ -33,9 +33,9 @@ fn main() -> ExitCode {
     }
 }
 
-/// Keeps software Vulkan from printing an irrelevant error on machines without a desktop: it looks for a Wayland
-/// display there, and its library complains if there is none, unless the display is given as an absolute path.
-#[expect(unsafe_code, reason = "that library can only be configured through the environment")]
+/// Suppresses an irrelevant error on machines without a desktop: software Vulkan connects to Wayland, and libwayland
+/// prints an error if `XDG_RUNTIME_DIR` is not set, unless `WAYLAND_DISPLAY` is an absolute path.
+#[expect(unsafe_code, reason = "libwayland can only be configured through the environment")]
 fn keep_wayland_quiet() {
     if std::env::var_os("XDG_RUNTIME_DIR").is_none() && std::env::var_os("WAYLAND_DISPLAY").is_none() {
         // SAFETY: this runs before anything else, so no other thread can read the environment.

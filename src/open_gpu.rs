@@ -20,11 +20,11 @@ pub(crate) fn open_gpu() -> session::Result<Arc<Gpu>> {
     };
     hide_caught_panics();
     check_open_for_tests()?;
-    // Lets tests lose the GPU once, when a model reaches this step.
+    // For tests: loses the GPU once, when a model reaches this step.
     if let Some(step) = std::env::var("FIELDRIG_TEST_LOSE_GPU_AT_STEP").ok().and_then(|text| text.parse().ok()) {
         session::lose_gpu_at_step(step);
     }
-    // Lets tests exhaust GPU memory.
+    // For tests: limits GPU memory.
     let memory_limit_bytes = std::env::var("FIELDRIG_TEST_GPU_BYTES").ok().and_then(|text| text.parse().ok());
     let gpu =
         Gpu::open(&GpuOptions { optional_features, matrices, memory_limit_bytes, adapter, ..GpuOptions::default() })?;
@@ -34,7 +34,7 @@ pub(crate) fn open_gpu() -> session::Result<Arc<Gpu>> {
     Ok(gpu)
 }
 
-/// Hides the message of a panic that is caught: wgpu panics if it notices a lost device while it waits.
+/// Hides the message of a panic that is caught: wgpu panics if it detects a lost device while waiting.
 fn hide_caught_panics() {
     static IS_SET: Once = Once::new();
     IS_SET.call_once(|| {

@@ -25,11 +25,11 @@ pub(crate) struct StdoutError(#[source] pub(crate) std::io::Error);
 
 /// The progress bars on stderr; log lines are printed above them.
 static BARS: LazyLock<MultiProgress> = LazyLock::new(|| MultiProgress::with_draw_target(target()));
-/// Whether a line of [`report`] could not be written.
+/// Whether any line of [`report`] could not be written.
 static LOST_OUTPUT: AtomicBool = AtomicBool::new(false);
 
-/// Maximum number of output chunks that wait to be written. Up to this many, a terminal that accepts no output, such as
-/// one behind a broken connection, does not block the program.
+/// Maximum number of output chunks that wait to be written. With a queue, a terminal that accepts no output, for
+/// example after a broken connection, does not block the program.
 const MAX_WAITING: usize = 4096;
 /// At exit, the program waits at most this long for its output to be written.
 const MAX_FLUSH: Duration = Duration::from_secs(5);

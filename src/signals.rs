@@ -1,8 +1,8 @@
 //! Signals that end a command: it stops, saves, and exits.
 //!
 //! SIGINT (Ctrl-C), SIGTERM and SIGHUP (the terminal was closed) request an orderly stop. A second Ctrl-C ends the
-//! process at once. SIGHUP never does, because a closing terminal sends it more than once: the kernel to the foreground
-//! group, the shell to its jobs. If SIGHUP is ignored, as under `nohup`, it stays ignored.
+//! process at once. SIGHUP never does, because closing a terminal sends it more than once: from the kernel to the
+//! foreground group, and from the shell to its jobs. If SIGHUP is ignored, as under `nohup`, it stays ignored.
 
 use anyhow::Context;
 use capture::Stop;
@@ -13,7 +13,7 @@ use signal_hook::iterator::Signals;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
-/// Shells report this plus the signal number for a process ended by a signal.
+/// Shells report this plus the signal number as the exit code of a process that a signal ended.
 const SIGNAL_EXIT_BASE: i32 = 128;
 
 /// Handles SIGINT, SIGTERM and SIGHUP of a command that saves its results; at most once per process.
@@ -26,7 +26,7 @@ pub(crate) fn stop_on_signals_logging(message: &'static str) -> anyhow::Result<S
     let (stop, signaled) = Stop::with_signal_flag(message);
     let interrupted = Arc::new(AtomicBool::new(false));
     let register = || -> std::io::Result<()> {
-        // A signal's actions run in the order of registration: the first Ctrl-C only sets the flags.
+        // Actions run in the order of registration, so the first Ctrl-C only sets the flags.
         flag::register_conditional_shutdown(SIGINT, SIGNAL_EXIT_BASE + SIGINT, interrupted.clone())?;
         flag::register(SIGINT, interrupted)?;
         termination_signals().try_for_each(|signal| flag::register(signal, signaled.clone()).map(drop))
@@ -35,7 +35,7 @@ pub(crate) fn stop_on_signals_logging(message: &'static str) -> anyhow::Result<S
     Ok(stop)
 }
 
-/// Makes the signals that end a process remove partial files first.
+/// Removes partial files before a signal ends the process.
 ///
 /// For commands that have nothing to save when they are cancelled; others use [`stop_on_signals`].
 pub(crate) fn remove_partial_files_on_signals() -> anyhow::Result<()> {

@@ -1,4 +1,4 @@
-//! Checks the dependencies between the crates of the workspace, read from `cargo metadata`, against the arrows of
+//! Checks the dependencies between the crates of the workspace, as reported by `cargo metadata`, against
 //! ARCHITECTURE.md.
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -49,7 +49,7 @@ fn dependencies() -> Dependencies {
         .collect()
 }
 
-/// Every forbidden arrow, and every crate without a rule.
+/// Every forbidden dependency, and every crate without a rule.
 fn violations(dependencies: &Dependencies) -> Vec<String> {
     let mut violations_found = Vec::new();
     let workspace_crates: BTreeSet<&str> = dependencies.keys().map(String::as_str).collect();

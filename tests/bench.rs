@@ -46,7 +46,7 @@ fn events(folder: &Path, args: &[&str]) -> Vec<Value> {
     stdout.lines().map(|line| serde_json::from_str(line).expect("one JSON object per line")).collect()
 }
 
-/// Asserts that a bench fails with one sentence that contains all `words`.
+/// Asserts that a bench fails with one error message that contains all `words`.
 fn assert_fails_with(folder: &Path, args: &[&str], code: i32, words: &[&str]) {
     let output = bench(folder, args);
     let printed = String::from_utf8_lossy(&output.stderr);
@@ -74,7 +74,7 @@ fn kernel_bench_reports_every_variant() {
     }
     assert!(
         row["n_visible"].as_u64().is_some_and(|n| (50..1500).contains(&n)),
-        "a part of the splats is visible: {row}"
+        "only some of the splats are visible: {row}"
     );
     let plain = Command::new(env!("CARGO_BIN_EXE_fieldrig"))
         .args([&["bench"], &args[..]].concat())
@@ -107,7 +107,7 @@ fn curve_bench_draws_peers_and_resumes() {
     let page = std::fs::read_to_string(folder.join("c/curve.html")).expect("a page");
     assert!(page.contains("<svg ") && page.contains("to 28 dB"));
 
-    // Finished runs are not repeated; only a removed run is.
+    // Only the removed run is repeated, not the finished one.
     let runs = std::fs::read_dir(folder.join("c/bench-runs")).expect("runs");
     let first = runs.map(|run| run.expect("a run").path()).min().expect("a run");
     std::fs::remove_file(first).expect("removed");
@@ -144,7 +144,7 @@ fn curve_bench_skips_methods_without_sufficient_data() {
     let one = ["curve", "deep", "flat", "--seconds", "0.4", "--seeds", "1", "--max-splats", "300", "--out", "c"];
     let printed = events(folder, &[&one[..], &["--method", "splat", "--json"]].concat());
     assert_eq!(printed.iter().filter(|event| event["event"] == "run").count(), 2);
-    // More methods are added in the same folder, and finished runs are not repeated.
+    // Adding methods in the same folder does not repeat finished runs.
     let printed = events(folder, &[&one[..], &["--method", "splat,tsdf,nerf", "--json"]].concat());
     let cached: Vec<bool> = printed.iter().filter_map(|event| event["cached"].as_bool()).collect();
     assert_eq!(cached, [true, false, false, true, false]);
@@ -160,7 +160,7 @@ fn curve_bench_skips_methods_without_sufficient_data() {
             assert!(line["summary"][known].as_f64() > Some(0.0), "{known}: {line}");
         }
     }
-    // A distance field is finished when each training image is fused, whatever the time limit.
+    // A distance field is finished when every training image is fused, regardless of the time limit.
     let tsdf = &lines[1]["runs"][0];
     assert_eq!(tsdf["end"]["step"], tsdf["settings"]["n_train"], "{tsdf}");
     assert_chart(&folder.join("c"), "curve");
@@ -234,7 +234,7 @@ fn stability_bench_is_repeatable_and_needs_times() {
         points.iter().map(|point| point["psnr"].as_f64().expect("a score")).collect()
     };
     assert_eq!(psnrs(&first).len(), 2);
-    assert_eq!(psnrs(&first), psnrs(&second), "one seed, one result");
+    assert_eq!(psnrs(&first), psnrs(&second), "the same seed gives the same result");
     assert_ne!(psnrs(&first)[0], psnrs(&first)[1], "the noise affects training");
     assert_chart(&folder.join("s"), "stability-pose-noise");
 

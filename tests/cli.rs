@@ -1,4 +1,4 @@
-//! Tests the command line as a new user sees it: help, exit codes, one clear sentence for wrong input.
+//! Tests the command line: help, exit codes, and one clear error message for invalid input.
 
 use std::path::Path;
 use std::process::{Command, Output, Stdio};
@@ -23,7 +23,7 @@ fn stderr(output: &Output) -> String {
     String::from_utf8(output.stderr.clone()).expect("stderr is UTF-8")
 }
 
-/// Asserts the exit code and one sentence on stderr that contains all `words`.
+/// Asserts the exit code and one error message on stderr that contains all `words`.
 fn assert_fails_with(args: &[&str], code: i32, words: &[&str]) {
     let output = fieldrig(args);
     let printed = stderr(&output);
@@ -71,7 +71,7 @@ fn missing_file_exits_with_1_and_is_named() {
     );
 }
 
-/// A shipped rig file with one piece of text replaced, next to the robot description that it refers to.
+/// Writes a shipped rig file with one piece of text replaced, and the robot description that it refers to.
 fn changed_rig(folder: &Path, from: &str, to: &str) -> String {
     let rigs = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs");
     let text = std::fs::read_to_string(rigs.join("static-arm.toml")).expect("a shipped rig file");
@@ -147,7 +147,7 @@ fn invalid_arguments_exit_with_2() {
         assert_fails_with(&["train", "absent", flag, value], 2, &[flag]);
         assert_fails_with(&["run", "absent.toml", flag, value], 2, &[flag]);
     }
-    // Checked before data are read: there are none here.
+    // Rejected before data is read: this folder does not exist.
     let refine = |words| ["train", "absent", "--method", "tsdf", "--refine", words];
     assert_fails_with(
         &refine("extrinsics,image-gains"),

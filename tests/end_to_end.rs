@@ -15,7 +15,8 @@ use trainer::gpu::{Gpu, GpuOptions};
 const N_IMAGES: i64 = 40;
 /// Steps of every run in this file.
 const N_STEPS: &str = "300";
-/// Measured 22.1 dB after these few steps, most of them coarse ones; the first keyframe's seeds alone score 16.4 dB.
+/// Measured 22.1 dB after these few steps, most of them at coarse resolution; the initial splats of the first keyframe
+/// score 16.4 dB.
 const MIN_PSNR: f64 = 21.0;
 /// Tolerance for forward kinematics, interpolation and camera extrinsics together.
 const MAX_POSITION_ERROR_M: f64 = 1e-4;
@@ -115,7 +116,7 @@ fn memory_bench_measures_a_run_with_a_viewer() {
     assert_eq!(left, 4, "the folder of the run is removed");
 }
 
-/// Number of keyframes fused.
+/// Number of keyframes to fuse.
 const N_FUSED: &str = "10";
 /// Measured 18 dB: regions not observed yet have no surface.
 const MIN_PSNR_OF_MESH: f64 = 15.0;
@@ -152,7 +153,7 @@ fn tsdf_runs_live_replays_and_resumes() {
     check_saved_model_renders(folder);
 
     let train = ["train", "scan.mcap", "--keyframes", "live/keyframes.txt"];
-    // Without alignment, which `run` does not do and whose result would be part of the model.
+    // Without registration: `run` did none, and corrections would be part of the model.
     let half = ["--method", "tsdf", "--refine", "none", "--json", "--steps", "4", "--out", "half"];
     let half = events(folder, &[&train[..], &half].concat());
     let rest = ["--resume", "half", "--json", "--steps", N_FUSED, "--out", "whole"];
@@ -245,7 +246,7 @@ fn interrupted(folder: &Path, args: &[&str], meanwhile: impl FnOnce(&Value)) -> 
     let serving = event().expect("the address");
     while event().expect("an event before the end")["event"] != "eval" {}
     meanwhile(&serving);
-    // The `kill` built into the shell, because a minimal system has no other.
+    // Uses the `kill` built into the shell, because minimal systems have no separate program.
     let interrupt_status =
         Command::new("sh").args(["-c", &format!("kill -INT {}", run.id())]).status().expect("sh starts");
     assert!(interrupt_status.success());
@@ -288,7 +289,7 @@ fn request_picture_of_each_method(url: &str) {
             }
         }
     };
-    // Both answers refer to the same model until the distance field has fused all images.
+    // Wait until the distance field has fused all images: then both requests show the same model.
     let mut ids = 1..200;
     let tsdf = loop {
         let mut next = || ids.next().expect("the ids do not run out");
@@ -304,9 +305,9 @@ fn request_picture_of_each_method(url: &str) {
     assert!(printed.contains("\"nerf\"") && printed.contains("tsdf, splat"), "{printed}");
 }
 
-/// `eval` of the saved model gives the same score as `run`.
+/// Checks that `eval` of the saved model gives the same score as `run`.
 fn check_saved_model_scores(folder: &Path, psnr: f64) {
-    /// The file keeps the parameters' bits; scores are sums in the same order.
+    /// The file stores the parameters exactly, and scores are summed in the same order.
     const TOLERANCE_DB: f64 = 1e-6;
     let list = ["--keyframes", "live/keyframes.txt", "--json"];
     let evaluated = events(folder, &[&["eval", "live", "scan.mcap"][..], &list[..]].concat());
@@ -337,7 +338,7 @@ fn check_saved_model_renders(folder: &Path) {
     assert!(folder.join(rendered[0]["depth"].as_str().expect("a depth file")).is_file());
 }
 
-/// Training on half a recording works; the exit code and one sentence report the truncation.
+/// Checks that training on half a recording works, and that the exit code and a message report the truncation.
 fn check_truncated_recording_is_a_loss(folder: &Path) {
     let whole = std::fs::read(folder.join("scan.mcap")).expect("the recording");
     std::fs::write(folder.join("half.mcap"), &whole[..whole.len() / 2]).expect("the disk has space");
@@ -432,7 +433,7 @@ fn decision_log_reproduces_a_real_time_run() {
     let again = replay("live/decisions.jsonl", "again", &[0, 3]);
     assert_eq!((&again["checkpoint_sha256"], &again["steps"]), (&live["checkpoint_sha256"], &live["steps"]));
     let log_again = std::fs::read_to_string(folder.join("again/decisions.jsonl")).expect("a log");
-    // Checkpoints do not affect decisions, and are due by the clock.
+    // Entries of checkpoints are ignored: checkpoints are written by the clock and do not affect decisions.
     let decisions = |log: &str| -> Vec<String> {
         log.lines().filter(|line| !line.contains("\"checkpoint\"")).map(str::to_owned).collect()
     };
@@ -453,7 +454,7 @@ fn decision_log_reproduces_a_real_time_run() {
     let stamp = number(pushed, "stamp_nanos").to_string();
     refused(log.replace(&stamp, "7"), "contains image 7 of camera \"wrist\", which is not in scan.mcap");
     let fingerprint = pushed["fingerprint"].as_str().expect("a fingerprint");
-    refused(log.replace(fingerprint, "0123"), &format!("image {stamp} of camera \"wrist\" has other pixels"));
+    refused(log.replace(fingerprint, "0123"), &format!("image {stamp} of camera \"wrist\" differs in pixels"));
 }
 
 /// A replay without images to train on stops with an error that names the problem.
@@ -532,7 +533,7 @@ fn wrong_hand_eye_calibration_is_corrected() {
     let record = fieldrig(folder, &["record", "rig.toml", "--sim", "--out", "scan.mcap"]);
     assert!(record.status.success(), "{}", String::from_utf8_lossy(&record.stderr));
 
-    // 5 mm, and 1 degree about the camera's axes: q * (sin, cos of half the angle).
+    // The error is 5 mm, and 1 degree about `axis` in the camera frame, multiplied from the right.
     let text = std::fs::read_to_string(folder.join("rig.toml")).expect("a rig file");
     let mut rig: toml::Table = text.parse().expect("TOML");
     let (right_m, right) = hand_eye(&folder.join("rig.toml"));
@@ -563,13 +564,13 @@ fn wrong_hand_eye_calibration_is_corrected() {
 
     let report = std::fs::read_to_string(folder.join("out/report.json")).expect("a report");
     let report: Value = serde_json::from_str(&report).expect("JSON");
-    let found = report["alignment"]["estimates"].as_array().expect("what was found");
+    let found = report["alignment"]["estimates"].as_array().expect("the estimates");
     assert_eq!(found.len(), 1, "only the hand-eye: {found:?}");
     assert_eq!(found[0]["parameter"], "hand-eye");
     assert!((number(&found[0], "rotation_rad").to_degrees() - 1.0).abs() < MAX_REMAINING_DEGREES);
     assert!(number(&found[0], "translation_sigma_m") < 5e-4);
 
-    // With the corrected rig, no correction remains.
+    // With the corrected rig file, no correction is needed.
     let args = ["train", "scan.mcap", "--rig", "found/rig.toml", "--refine", "auto", "--steps", "8", "--out", "again"];
     events(folder, &[&args[..], &["--json"]].concat());
     let report = std::fs::read_to_string(folder.join("again/report.json")).expect("a report");

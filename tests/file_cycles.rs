@@ -30,14 +30,14 @@ type Module = Vec<String>;
 /// The modules that each module imports from.
 type Graph = BTreeMap<Module, BTreeSet<Module>>;
 
-/// What one file imports and re-exports.
+/// Imports and re-exports of one file.
 #[derive(Default)]
 struct File {
     /// Paths as written: relative ones start with `self`, `super`, or the name of a submodule.
     paths: Vec<Module>,
-    /// Re-exported names and where they come from.
+    /// Re-exported names and the paths that they refer to.
     exports: BTreeMap<String, Module>,
-    /// Submodules in files of their own that are only compiled for tests.
+    /// Submodules in separate files that are compiled only for tests.
     test_modules: Vec<String>,
 }
 
@@ -147,7 +147,7 @@ fn files_in(root: &Path) -> BTreeMap<Module, File> {
     files
 }
 
-/// Makes a path of a module relative to the crate root; `None` if it leads to another crate.
+/// Converts a path that is used in `module` to a path from the crate root; `None` if it leads to another crate.
 fn absolute(module: &Module, path: &[String], is_module: impl Fn(&Module) -> bool) -> Option<Module> {
     let mut base = module.clone();
     let mut rest = path;
@@ -172,7 +172,7 @@ fn absolute(module: &Module, path: &[String], is_module: impl Fn(&Module) -> boo
     Some(base)
 }
 
-/// The file that defines what a path names, through re-exports.
+/// The file that defines the item at a path; follows re-exports.
 fn defining_file(files: &BTreeMap<Module, File>, path: &Module, depth: u32) -> Module {
     let length = (0..=path.len()).rev().find(|length| files.contains_key(&path[..*length])).unwrap_or(0);
     let (module, rest) = (path[..length].to_vec(), &path[length..]);
@@ -205,7 +205,7 @@ fn graph(files: &BTreeMap<Module, File>) -> Graph {
         .collect()
 }
 
-/// All files that are on a cycle, with the imports that form it.
+/// All imports that are part of a cycle.
 fn cycles(graph: &Graph) -> Vec<String> {
     let reachable = |from: &Module| {
         let mut reached = BTreeSet::new();

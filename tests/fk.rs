@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 const PANDA: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/kinematics/tests/data/panda.urdf");
-/// Meters and rotation matrix elements: rounding of a dozen products of numbers near 1.
+/// For meters and rotation matrix elements: rounding errors of a dozen products of numbers near 1.
 const TOLERANCE: f64 = 1e-12;
 
 /// Exit code, stdout and stderr of `fieldrig fk` with these joints.

@@ -1,4 +1,4 @@
-//! A GPU that is lost during a run or has too little memory: the run continues, or stops without losing its results.
+//! Tests runs whose GPU is lost or has too little memory: they continue, or stop without losing their results.
 #![expect(clippy::unwrap_used, reason = "a test that cannot continue may panic")]
 
 mod photos;
@@ -86,7 +86,7 @@ fn out_of_gpu_memory_stops_growth() {
         fieldrig(folder, &["train", "data", "--json", "--steps", "300", "--plan-steps", "1500", "--out", out], env)
     };
     let free = done(&train("free", &[]));
-    // Enough memory to train and render the first 50 000 splats, but not half as many more.
+    // Enough memory to train and render the first 50 000 splats, but not 75 000.
     let full = train("full", &[("FIELDRIG_TEST_GPU_BYTES", "48000000")]);
     let text = stderr(&full);
     assert_eq!(text.matches("the model stops growing at").count(), 1, "{text}");
@@ -94,7 +94,7 @@ fn out_of_gpu_memory_stops_growth() {
     assert_eq!(full["steps"], 300);
     assert!(full["primitives"].as_u64() < free["primitives"].as_u64(), "{full} {free}");
 
-    // Not enough memory to start: one sentence, and no panic.
+    // Not enough memory to start: one error message, and no panic.
     let none = train("none", &[("FIELDRIG_TEST_GPU_BYTES", "3000000")]);
     assert_eq!(none.status.code(), Some(1));
     assert!(stderr(&none).contains("the GPU ran out of memory: buffer"), "{}", stderr(&none));

@@ -42,7 +42,7 @@ fn metrics_are_one_json_object() {
     let folder = tempfile::tempdir().unwrap();
     let (a, b) = (picture(folder.path(), "a.png", 20, 6), picture(folder.path(), "b.png", 20, 0));
     let scores = json_of(&fieldrig(&["metrics", text(&a), text(&b), "--json"]));
-    // One of three color channels is off by 6 everywhere.
+    // One of three color channels differs by 6 everywhere.
     let expected_db = 10.0 * (255.0_f64.powi(2) / 12.0).log10();
     assert!((scores["psnr"].as_f64().unwrap() - expected_db).abs() < 1e-9, "{scores}");
     assert!((0.5..1.0).contains(&scores["ssim"].as_f64().unwrap()), "{scores}");

@@ -1,4 +1,4 @@
-//! Failed output never costs the result: closed terminals, closed pipes, full disks.
+//! Tests that a closed terminal, a closed pipe or a full disk never loses the result.
 #![cfg(target_os = "linux")]
 #![expect(clippy::unwrap_used, reason = "a test that cannot continue may panic")]
 
@@ -17,7 +17,7 @@ use std::time::{Duration, Instant};
 const EXE: &str = env!("CARGO_BIN_EXE_fieldrig");
 /// Longer than any of these commands takes on a busy machine.
 const TIMEOUT: Duration = Duration::from_secs(240);
-/// Exit code for losses, which include dropped lines of output.
+/// Exit code for losses, which include lost lines of output.
 const LOSS: i32 = 3;
 
 /// A program on a pseudoterminal that can be closed.
@@ -116,7 +116,7 @@ fn training_survives_a_closed_terminal_without_sighup() {
     run.wait_for("step");
     assert_eq!(run.close().code(), Some(LOSS));
     let report = std::fs::read_to_string(folder.join("out/report.json")).unwrap();
-    assert!(report.contains("\"steps\": 300"), "it trained to the end");
+    assert!(report.contains("\"steps\": 300"), "training did not reach its end");
     expect_model(folder, "out");
 }
 
@@ -125,7 +125,7 @@ fn training_is_not_blocked_by_a_full_terminal() {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
     wall::write(&folder.join("data"), true, 0.0);
-    // Like a broken connection: the terminal exists, but nothing reads it. 8 kB fill it.
+    // As after a broken connection, the terminal exists, but nothing reads it. 8 kB fill it.
     let args = ["train", "data", "--steps", "300", "--max-splats", "600", "--out", "out", "-vv"];
     let mut run = OnTerminal::start(folder, &args, true);
     run.wait_for("of 10 images");
@@ -146,7 +146,7 @@ fn training_survives_a_closed_pipe_and_full_stdout() {
         command.current_dir(folder);
         command
     };
-    // Like `| head -1`.
+    // As with `| head -1`.
     let mut head = train("head").stdout(Stdio::piped()).stderr(Stdio::null()).spawn().unwrap();
     let mut line = String::new();
     BufReader::new(head.stdout.take().unwrap()).read_line(&mut line).unwrap();
@@ -160,11 +160,11 @@ fn training_survives_a_closed_pipe_and_full_stdout() {
     assert_eq!(output.status.code(), Some(LOSS), "{printed}");
     assert!(printed.contains("cannot write to stdout") && printed.contains("No space left"), "{printed}");
     expect_model(folder, "full");
-    // Also without stderr.
+    // The same without stderr.
     assert_eq!(train("mute").stdout(full()).stderr(full()).status().unwrap().code(), Some(LOSS));
     expect_model(folder, "mute");
 
-    // If the output is the result, a full output is a failure.
+    // A command whose result is its output fails if stdout is full.
     let mut fk = Command::new(EXE);
     fk.args(["metrics", "data/00.png", "data/00.png"]).current_dir(folder);
     assert_eq!(fk.stdout(full()).output().unwrap().status.code(), Some(1), "the result is lost");
@@ -201,7 +201,7 @@ struct SmallDisk<'a>(&'a Path);
 
 #[cfg(feature = "sim")]
 impl<'a> SmallDisk<'a> {
-    /// `None` if this user may not mount one.
+    /// Returns `None` if this user may not mount a file system.
     fn mount(at: &'a Path, size: &str) -> Option<Self> {
         std::fs::create_dir(at).unwrap();
         let option = format!("size={size}");
@@ -236,7 +236,7 @@ fn full_disk_keeps_recording_readable_and_saves_model_elsewhere() {
     let count = |key: &str| reported[key].as_u64().unwrap();
     let n_samples = ["images", "depth_images", "joint_states", "truths"].map(count).iter().sum::<u64>();
     assert!(printed.contains(&format!("({n_samples} samples)")), "{n_samples}: {printed}");
-    // A reader must count the same number of samples.
+    // Reading the file must give the same number of samples.
     let read = wall::fieldrig(folder, &["export", "disk/run.mcap", "--to", "nerfstudio", "--out", "read"]);
     let export_stderr = String::from_utf8_lossy(&read.stderr);
     assert!(export_stderr.contains(&format!("after {n_samples} readable samples")), "{n_samples}: {export_stderr}");

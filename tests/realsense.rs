@@ -1,5 +1,5 @@
-//! A rig whose camera is a file recorded by librealsense2: the binary reads lens and depth pose from it and records
-//! its images.
+//! A rig whose camera is a file recorded by librealsense2: the binary reads lens and depth pose from this file and
+//! records its images.
 
 use drivers::realsense::emulated::{BagWriter, EmulatedCamera, EmulatedDepth};
 use drivers::recording::{RIG_FILE, Recording};

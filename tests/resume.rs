@@ -51,19 +51,19 @@ fn resumed_training_equals_uninterrupted_training() {
     assert_eq!(both["checkpoint_sha256"], whole["checkpoint_sha256"]);
     assert_eq!((&both["steps"], &both["psnr"], &both["bytes"]), (&whole["steps"], &whole["psnr"], &whole["bytes"]));
     assert!(both["seconds"].as_f64() > half["seconds"].as_f64(), "the clock continues");
-    // The whole state is the same, not only the model, so either could be resumed.
+    // The whole state is identical, not only the model, so both runs can be resumed.
     let [one, other] = ["whole", "both"].map(|run| Checkpoint::read(&folder.join(run).join("training.ckpt")).unwrap());
     assert!(one.state == other.state && one.arrays == other.arrays);
 
-    // A finished run reports that and changes nothing.
+    // Resuming a finished run changes nothing and reports `finished`.
     let finished = train(folder, &["--resume", "both"]).output().unwrap();
     assert_eq!(finished.status.code(), Some(0), "{}", String::from_utf8_lossy(&finished.stderr));
     let finished: Value = serde_json::from_slice(&finished.stdout).unwrap();
     assert_eq!((&finished["event"], &finished["out"]), (&json!("finished"), &json!("both")));
     assert!(!folder.join("runs").exists());
 
-    // When the requested number of steps is already reached, it saves the model in a new folder, because its own
-    // already contains a model.
+    // If the requested number of steps is already reached, the model is saved in a new folder, because the folder of
+    // the run already contains a model.
     let again = done(folder, &["--resume", "both", "--steps", N_STEPS, "--checkpoint-secs", "0"]);
     assert_eq!(again["checkpoint_sha256"], whole["checkpoint_sha256"]);
     let out = folder.join(again["out"].as_str().unwrap());
@@ -81,7 +81,7 @@ fn check_invalid_checkpoints_are_reported(folder: &Path) {
     };
     assert!(printed(&whole[..whole.len() / 2]).contains("truncated"));
     assert!(
-        printed(&[&whole[..8], &[9], &whole[9..]].concat()).contains("version 9 of the format, this program reads 4")
+        printed(&[&whole[..8], &[9], &whole[9..]].concat()).contains("format version 9, this program reads version 4")
     );
     let mut damaged = whole.clone();
     damaged[whole.len() / 2] ^= 1;
@@ -100,7 +100,7 @@ fn check_invalid_checkpoints_are_reported(folder: &Path) {
     }
     let printed = assert_fails(&train(folder, &["--resume", "data"]).output().unwrap(), 1);
     assert!(printed.contains("no checkpoint to resume from in data") && printed.contains("training.ckpt"), "{printed}");
-    assert!(!folder.join("x").exists(), "what is refused leaves nothing behind");
+    assert!(!folder.join("x").exists(), "a rejected command leaves no files behind");
 }
 
 #[test]
@@ -115,7 +115,7 @@ fn decision_log_reproduces_a_timed_training() {
     assert!(timed["steps"].as_u64() > Some(0));
     assert_eq!((&again["checkpoint_sha256"], &again["steps"]), (&timed["checkpoint_sha256"], &timed["steps"]));
 
-    // A resumed run is replayed from its checkpoint only. Scale and test images are taken from the checkpoint.
+    // A resumed run can be replayed only from its checkpoint, which also defines scale and test images.
     let both = done(folder, &["--resume", "timed", "--seconds", "2", "--out", "both"]);
     assert_ne!(both["checkpoint_sha256"], timed["checkpoint_sha256"]);
     let log = format!("both/decisions-from-{}.jsonl", timed["steps"]);
@@ -163,7 +163,7 @@ fn repeatedly_killed_training_is_identical() {
             assert!(spawned.elapsed() < Duration::from_secs(120), "no checkpoint");
             std::thread::sleep(Duration::from_millis(1));
         }
-        // Never at the same point of the cycle of steps and checkpoints.
+        // Each kill is at a different point in the cycle of steps and checkpoints.
         std::thread::sleep(Duration::from_micros(u64::from(kill * 23 % 37) * 8000 + 137 * u64::from(kill)));
         run.kill().unwrap();
         run.wait().unwrap();
@@ -173,15 +173,15 @@ fn repeatedly_killed_training_is_identical() {
     assert!(steps.is_sorted() && steps[0] > 0, "{steps:?}");
     eprintln!("killed at steps {steps:?}");
     if folder.join("killed/splats.ply").exists() {
-        return; // On a very fast machine, training ended before it was killed.
+        return; // On a very fast machine, training ends before the last kill.
     }
     let end = done(folder, &resumed);
     assert_eq!(end["checkpoint_sha256"], whole["checkpoint_sha256"]);
     assert!(folder.join("killed/splats.ply").exists(), "it continued in the same folder");
 }
 
-/// Kills a live run, resumes it, and checks that the result is that of one run: its time and keyframes are kept, and
-/// steps are added.
+/// Kills a live run, resumes it, and checks that the result is like that of a single run: time and keyframes are kept,
+/// and steps are added.
 #[cfg(feature = "sim")]
 #[test]
 fn killed_live_run_resumes_keyframes_and_clock() {
@@ -225,7 +225,7 @@ fn killed_live_run_resumes_keyframes_and_clock() {
     let stamps = list.lines().filter_map(|line| line.split(' ').nth(1)?.parse::<i64>().ok());
     assert!(stamps.clone().count() >= n_stored_at_kill && stamps.is_sorted(), "{list}");
 
-    // The run is finished now; a longer time limit continues it in a new folder.
+    // The run is finished. With a longer time limit, it continues in a new folder.
     let finished = run(&["--resume", "out"]).output().unwrap();
     assert!(finished.status.success());
     assert!(String::from_utf8_lossy(&finished.stdout).contains("\"finished\""));

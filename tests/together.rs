@@ -1,4 +1,5 @@
-//! Several methods trained in parallel from the same images: each gives the same result as alone, in its own folder.
+//! Tests several methods that train in parallel on the same images: each gives the same result as alone, in its own
+//! folder.
 
 mod wall;
 
@@ -68,7 +69,7 @@ fn several_methods_equal_single_trainings() {
     assert_fails_with(folder, &["train", "data", "--out", "all"], &["already contains a model", "splat/model.json"]);
 }
 
-/// The folder of each method is that of an independent run.
+/// Checks that the folder of each method can be used like the folder of a single run.
 fn check_resume_of_one_method(folder: &Path, splat: &Value) {
     let again = trained(folder, &["--replay-decisions", "all/splat/decisions.jsonl", "--out", "again"]);
     assert_eq!(done_events(&again)[0]["checkpoint_sha256"], splat["checkpoint_sha256"]);
@@ -80,7 +81,7 @@ fn check_resume_of_one_method(folder: &Path, splat: &Value) {
     assert_eq!(evaluated["psnr"], splat["psnr"]);
 }
 
-/// Only distance fields have meshes, which can be made coarser.
+/// Checks that distance fields export their mesh, whole or simplified, and other models have none.
 fn check_mesh_export(folder: &Path) {
     let export = |to: &str, more: &[&str], out: &str| {
         let output = fieldrig(folder, &[&["export", "all/tsdf", "--to", to, "--out", out], more].concat());
@@ -115,8 +116,8 @@ fn check_mesh_export(folder: &Path) {
 
 #[test]
 fn several_methods_share_time_and_one_clock() {
-    /// Time slices are assigned by time. Steps of splats become longer, and the last time slice on a slow machine is
-    /// a large part.
+    /// Methods share the time equally, but steps of splats become longer, and on a slow machine the last time slice is
+    /// a large part of the time.
     const MAX_TIME_RATIO: f64 = 3.0;
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();

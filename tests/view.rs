@@ -50,7 +50,7 @@ impl View {
         url.trim_start_matches("http://").trim_end_matches('/').parse().expect("numbers")
     }
 
-    /// Ends it with SIGINT, as Ctrl-C does.
+    /// Ends the program with SIGINT, as Ctrl-C does.
     fn interrupt(mut self) -> ExitStatus {
         let kill = format!("kill -INT {}", self.process.id());
         assert!(Command::new("sh").args(["-c", &kill]).status().expect("sh starts").success());
@@ -95,7 +95,7 @@ impl Client {
         }
     }
 
-    /// The first messages of these types.
+    /// The first message of each of these types.
     fn first<const N: usize>(&mut self, types: [&str; N]) -> [Value; N] {
         let mut found = types.map(|_| Value::Null);
         while found.iter().any(Value::is_null) {
@@ -136,7 +136,7 @@ fn pose_of(message: &Value) -> Vec<f64> {
     pose.iter().map(|number| number.as_f64().expect("a number")).collect()
 }
 
-/// The picture that `render` draws of a model from a pose.
+/// Renders a model from a pose with `fieldrig render`.
 fn rendered(folder: &Path, model: &str, pose: &[f64], out: &str) -> image::RgbImage {
     let pose = pose.iter().map(f64::to_string).collect::<Vec<_>>().join(" ");
     let (size, fov) = (format!("{}x{}", SIZE_PX[0], SIZE_PX[1]), FOV_DEGREES.to_string());
@@ -146,14 +146,14 @@ fn rendered(folder: &Path, model: &str, pose: &[f64], out: &str) -> image::RgbIm
     image::open(folder.join(out).join("00000.png")).expect("a picture").into_rgb8()
 }
 
-/// Mean difference of the colors of two pictures, in 255ths.
+/// Mean difference of the colors of two pictures, on a scale of 0 to 255.
 fn difference(a: &image::RgbImage, b: &image::RgbImage) -> f64 {
     assert_eq!(a.dimensions(), b.dimensions());
     let sum: f64 = a.as_raw().iter().zip(b.as_raw()).map(|(a, b)| f64::from(a.abs_diff(*b))).sum();
     sum / a.as_raw().len() as f64
 }
 
-/// Mean brightness, in 255ths.
+/// Mean brightness, on a scale of 0 to 255.
 fn brightness(picture: &image::RgbImage) -> f64 {
     picture.as_raw().iter().map(|value| f64::from(*value)).sum::<f64>() / picture.as_raw().len() as f64
 }
@@ -203,7 +203,7 @@ fn view_matches_render() {
     check_view_without_cameras(folder);
 }
 
-/// A model without a list of cameras is first viewed from outside, whichever axis is up.
+/// Checks that a model without a list of cameras is first shown from outside, for each up axis.
 fn check_view_without_cameras(folder: &Path) {
     let model = folder.join("all/splat/splats.ply");
     std::fs::copy(&model, folder.join("lone.ply")).expect("the disk has space");
@@ -235,7 +235,7 @@ fn check_view_without_cameras(folder: &Path) {
     }
 }
 
-/// Asserts the exit code and one sentence on stderr that contains all `words`.
+/// Asserts the exit code and one error message on stderr that contains all `words`.
 fn assert_fails_with(folder: &Path, args: &[&str], code: i32, words: &[&str]) {
     let output = fieldrig(folder, args);
     let printed = String::from_utf8_lossy(&output.stderr);
@@ -277,7 +277,7 @@ fn explicit_port_in_use_is_an_error_default_falls_back() {
     let occupied = TcpListener::bind("127.0.0.1:0").expect("a free port");
     let address = occupied.local_addr().expect("bound").to_string();
     assert_fails_with(folder, &["view", "model", "--listen", &address], 1, &[&address, "in use", "--listen"]);
-    // Used by this test, or already in use.
+    // The default port is in use after this, by this test or by another program.
     let _default_port = TcpListener::bind("127.0.0.1:7007");
     let view = View::start(folder, &["model"]);
     assert_ne!(view.address().port(), 7007);
@@ -345,7 +345,7 @@ fn printed_commands_work_and_report_page_is_written() {
     // Image, render, error and depth of both test images.
     assert_eq!(pictures.len(), 8);
     assert!(pictures.iter().all(|picture| picture.dimensions() == (36, 27)), "photos of 48x36, shrunk");
-    // Each render is of its own test image rather than the other one.
+    // Each render shows its own test image, not the other one.
     let [difference_to_own, difference_to_other] = [0, 4].map(|ix| difference(&pictures[ix], &pictures[1]));
     assert!(
         difference_to_own < 0.7 * difference_to_other && brightness(&pictures[1]) > 30.0,

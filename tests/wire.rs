@@ -1,5 +1,5 @@
-//! Runs `fieldrig sim` in one process and the production drivers in others: emulated samples arrive unchanged, and
-//! the arm can be moved.
+//! Runs `fieldrig sim` in one process and the production drivers in others. Emulated samples must arrive unchanged, and
+//! the arm must be movable.
 
 #![cfg(target_os = "linux")]
 
@@ -10,13 +10,13 @@ use std::io::{BufRead, BufReader};
 use std::path::Path;
 use std::process::{Child, ChildStdout, Command, Stdio};
 
-/// Start delay in seconds, for busy machines.
+/// Start delay in seconds, sufficient for busy machines.
 const START_IN: &str = "5";
 
 /// A ready `fieldrig sim`; killed on drop.
 struct EmulatedRig {
     child: Child,
-    /// `fieldrig sim` ends if nothing reads its output.
+    /// Keeps the pipe open, so that `fieldrig sim` does not lose output.
     _stdout: BufReader<ChildStdout>,
 }
 
@@ -61,7 +61,7 @@ fn emulated_franka_rig_is_recorded_and_moved() {
     assert!(matches!(code, Some(0 | 3)), "{printed}");
     let difference = compare::difference(&script, &wire);
     assert!(difference.n_images >= 60, "{difference:?}");
-    // A joint rotates by at most half a radian per second here: a millisecond is half a milliradian.
+    // Here, joints rotate by at most half a radian per second, that is, half a milliradian per millisecond.
     assert!(difference.joints_rad[0] < 5e-4, "{difference:?}");
     assert_eq!(difference.base_m, 0.0, "the base is stationary");
 

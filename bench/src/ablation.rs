@@ -18,7 +18,7 @@ const DEFAULT_SECONDS: f64 = 16.0;
 /// Times at which the table lists the PSNR, seconds.
 const TABLE_SECS: [f64; 2] = [1.0, 4.0];
 
-/// The unchanged method, with which all variants are compared.
+/// The unchanged method, to which all variants are compared.
 const BASELINE: Variant<SplatOptions> = Variant { name: "baseline", change: |_| () };
 
 const VARIANTS: &[Variant<SplatOptions>] = &[
@@ -46,7 +46,7 @@ pub struct AblationOptions {
     pub steps: Option<u64>,
     /// Runs of each variant, with consecutive seeds.
     pub seeds: u64,
-    /// Only the variants whose names contain one of these words; empty: all.
+    /// Measures only the variants whose names contain one of these words; all variants if empty.
     pub only: Vec<String>,
     /// Models, images and folder.
     pub runs: RunsOptions,
@@ -62,7 +62,7 @@ struct VariantResult {
     lpips: Option<f64>,
     depth_rmse_m: Option<f64>,
     primitives: f64,
-    /// Median over the seeds of the PSNR gain of the baseline over the variant, dB.
+    /// PSNR of the baseline minus PSNR of the variant, median over the seeds, dB.
     gain_db: f64,
     /// Standard deviation of these gains; `None` with a single seed.
     gain_std_db: Option<f64>,
@@ -86,7 +86,7 @@ pub fn run(options: &AblationOptions, host: &Host<'_>) -> Result<BenchResult> {
         VARIANTS.iter().filter(|change| is_change(change, &base_options)).filter(is_selected).collect();
     if changes.is_empty() {
         let names: Vec<&str> = VARIANTS.iter().map(|change| change.name).collect();
-        return Err(Error::BadInput(format!("--only: no row has such a name; rows: {}", names.join(", "))));
+        return Err(Error::BadInput(format!("--only: no variant matches; variants: {}", names.join(", "))));
     }
     if options.runs.training.count.is_some() {
         return Err(Error::BadInput("--count: this bench sets it; remove the flag".into()));
@@ -181,7 +181,7 @@ fn findings(
     rows: &[VariantResult],
 ) -> Result<(Findings, PathBuf)> {
     let length = session::limits(options.seconds, options.steps, DEFAULT_SECONDS)?.describe();
-    let mut head = vec!["trained".to_owned()];
+    let mut head = vec!["variant".to_owned()];
     head.extend(TABLE_SECS.map(|secs| format!("at {secs} s, dB")));
     head.extend(["at the end, dB", "gain, dB", "SSIM", "LPIPS", "depth RMSE, mm", "splats"].map(str::to_owned));
     let findings = Findings {
@@ -189,8 +189,8 @@ fn findings(
         title: format!("Contribution of each part: {}", data.name),
         sentences: vec![
             format!(
-                "Each row is trained for {length} with one part removed or changed, and scored on test images; medians of {} seeds. \
- Gain: PSNR of the baseline minus that of the row, for the same seed.",
+                "Each row is a variant with one part removed or changed, trained for {length} and scored on test images; medians of {} seeds. \
+ Gain: PSNR of the baseline minus PSNR of the variant, for the same seed.",
                 options.seeds
             ),
             format!("{}; fieldrig {}.", runs.adapter(), env!("CARGO_PKG_VERSION")),

@@ -1,4 +1,4 @@
-//! Accuracy over the number of splats, and the number that the trainer chooses.
+//! Accuracy over the number of splats, compared with the number that the trainer chooses.
 
 use crate::findings::{BenchResult, Findings};
 use crate::runs::{Host, Job, NamedData, Run, Runs, RunsOptions};
@@ -35,7 +35,7 @@ pub struct BudgetOptions {
     pub runs: RunsOptions,
 }
 
-/// The runs with one limit.
+/// The runs with one limit on the number of splats.
 #[derive(Clone, Debug, Serialize)]
 struct Capped {
     /// The limit; `None` if the trainer chooses the number.
@@ -70,7 +70,7 @@ pub fn run(options: &BudgetOptions, host: &Host<'_>) -> Result<BenchResult> {
     let mut caps: Vec<Option<u32>> = options.splats.iter().copied().map(Some).collect();
     caps.sort_unstable();
     caps.dedup();
-    // The number chosen by the trainer comes first, because most readers want it.
+    // The number chosen by the trainer is measured first, because it is the most important result.
     caps.insert(0, None);
     let mut runs = Runs::open(&options.runs, host)?;
     runs.expect(caps.len() as u64 * options.seeds);
@@ -122,7 +122,7 @@ impl Capped {
     }
 }
 
-/// Gains per doubling between neighboring limits, where the number of splats grew.
+/// Gains per doubling between neighboring limits, if the number of splats grew from one to the next.
 fn gains(by_cap: &[&Capped]) -> Vec<Gain> {
     let pairs = by_cap.windows(2);
     let gain = |pair: &[&Capped]| {
@@ -175,7 +175,7 @@ fn findings(
     };
     let gain_chart = Chart {
         title: "Gain from doubling the splats".into(),
-        subtitle: format!("{subtitle}; each point between two neighboring caps"),
+        subtitle: format!("{subtitle}; each point is between two neighboring caps"),
         x: x("splats (log)"),
         y: Axis { label: "gain, dB per doubling".into(), scale: Scale::Linear, ticks: Vec::new() },
         lines: vec![line("gain per doubling", gains.iter().map(gain_point).collect())],
@@ -198,8 +198,8 @@ fn findings(
         sentences: vec![
             format!(
                 "Each point is a model trained for {length} with a cap on its splats and scored on test images. \
- In the run without a cap, the trainer chooses the number (at most {}): it is halved as long as \
- that costs less than {MIN_GAIN_DB} dB on validation images.",
+ In the run without a cap, the trainer chooses the number of splats (at most {}): it halves the number as long as \
+ this costs less than {MIN_GAIN_DB} dB on validation images.",
                 data.splats()?.specific.max_splats
             ),
             format!("Doubling the splats is not worthwhile if it gains less than {MIN_GAIN_DB} dB."),
@@ -227,7 +227,7 @@ mod tests {
     use crate::runs::tests::run;
 
     #[test]
-    fn gains_are_between_caps_that_were_reached() {
+    fn caps_that_are_not_reached_give_no_gain() {
         let capped = |cap: u32, n_splats: u64, psnr: f64| {
             Capped::of(Some(cap), vec![run("a", &[(1.0, psnr)], n_splats)]).expect("a run")
         };

@@ -13,7 +13,7 @@ use std::collections::{BTreeMap, HashSet};
 use std::path::PathBuf;
 use trainer::{ModelKind, ModelSpec};
 
-/// PSNR levels for which the time to reach them is reported, dB.
+/// PSNR levels for which the time to reach the level is reported, dB.
 const TARGET_DB: [f64; 3] = [25.0, 28.0, 30.0];
 /// Default training time of a run, seconds.
 pub const DEFAULT_SECONDS: f64 = 60.0;
@@ -46,7 +46,7 @@ struct CurveResult {
     runs: Vec<Run>,
 }
 
-/// The runs at one evaluation.
+/// PSNR of several runs at one evaluation.
 #[derive(Debug, PartialEq, Serialize)]
 struct CurvePoint {
     /// Median time.
@@ -65,7 +65,7 @@ struct Summary {
     psnr: Option<f64>,
     /// Standard deviation over the runs, dB.
     psnr_std: Option<f64>,
-    /// Median time at the end. A method that is done ends before its time limit.
+    /// Median training time. A method that finishes early does not use its whole time limit.
     seconds: Option<f64>,
     primitives: Option<f64>,
     primitives_extent: Option<[f64; 2]>,
@@ -89,7 +89,7 @@ struct FinalValues {
 #[derive(Debug, PartialEq, Serialize)]
 struct TimeToQuality {
     psnr: f64,
-    /// Median over the runs that reached it.
+    /// Median over the runs that reached the level.
     seconds: Option<f64>,
     n_runs: usize,
 }
@@ -132,7 +132,7 @@ pub fn run(options: &CurveOptions, host: &Host<'_>) -> Result<BenchResult> {
                     keyframes: &|| data.data.keyframes.clone(),
                     is_thorough: true,
                 })?);
-                // Written after every run, so that an interrupted bench leaves results.
+                // Findings are written after every run, so that an interrupted bench leaves results.
                 bench.results.pop();
                 bench.results.push(CurveResult::of_runs(&data, model_spec.kind, finished.clone()));
                 page = Some(bench.findings(&runs)?);
@@ -201,8 +201,8 @@ impl CurveResult {
 
 /// Median and range at each scheduled evaluation that at least half of the runs reached, ordered by time.
 fn median_curve(curves: &[Vec<(f64, f64)>]) -> Vec<CurvePoint> {
-    // Keyed by the bits of the scheduled time, which sort like the time; a final evaluation between two of them gets
-    // its own key.
+    // Keyed by the bits of the scheduled time, which sort like the time. The flag marks a final evaluation between two
+    // scheduled times, which gets a separate group.
     let mut groups: BTreeMap<(u64, bool), Vec<(f64, f64)>> = BTreeMap::new();
     for curve in curves {
         let mut taken = HashSet::new();
@@ -274,8 +274,8 @@ struct Bench<'a> {
 }
 
 impl Bench<'_> {
-    /// The methods that these data support. If there is only one method, it is returned anyway and reports the problem
-    /// itself.
+    /// The methods that support these data. If there are none, all methods are returned, so that training reports the
+    /// problem.
     fn applicable<'a>(&mut self, data: &'a NamedData) -> Vec<&'a ModelSpec> {
         let (applicable, without_depth): (Vec<_>, Vec<_>) = data
             .model_specs
@@ -286,7 +286,7 @@ impl Bench<'_> {
         }
         for model_spec in without_depth {
             let note =
-                format!("{} has no depth, which {} needs: there is no such line", data.name, model_spec.kind.name());
+                format!("{} has no depth, which {} needs: this line is omitted", data.name, model_spec.kind.name());
             log::warn!("{note}");
             self.notes.push(note + ".");
         }
@@ -336,14 +336,14 @@ impl Bench<'_> {
         };
         let mut sentences = vec![
             format!(
-                "Each line is one method on one data set, trained {n_seeds} times for {seconds} s with different seeds; loading \
- and scoring do not count. PSNR is the mean over the test images."
+                "Each line is one method on one data set, trained {n_seeds} times for {seconds} s with different seeds. Time \
+ excludes loading and scoring. PSNR is the mean over the test images."
             ),
-            "The time to a PSNR level is interpolated between two evaluations over the logarithm of time; for a curve that starts \
- above the level, it is the time of the first evaluation. Curves of peers come from their files, possibly from another computer."
+            "The time to reach a PSNR level is interpolated between two evaluations over the logarithm of time. For a curve that starts \
+ above the level, it is the time of the first evaluation. Curves of peers are read from files and may come from another computer."
                 .into(),
-            "Primitives are splats, voxel blocks (tsdf) or table entries (nerf). A distance field is done after fusing \
- every image once; its line ends there."
+            "Primitives are splats, voxel blocks (tsdf) or table entries (nerf). The line of a distance field ends when \
+ every image has been fused once."
                 .into(),
         ];
         sentences.extend(self.notes.iter().cloned());

@@ -1,11 +1,11 @@
-//! Disturbances of keyframes, one size at a time.
+//! Disturbs keyframes, for example with pose noise or a clock offset of a given size.
 //!
 //! A clock offset and an exposure step affect all images including test images, as they would on a robot. Pose noise
-//! affects only training images: test images keep their true poses, so that the scores measure the model.
+//! does not affect test images: they keep their true poses, so that the scores measure the model.
 //!
-//! A disturbance is a stateless function of its size, a seed and the keyframes. Its effect on one keyframe does not
-//! depend on the order of the others. All sizes with one seed share their random directions, which keeps curves over
-//! the size free of extra noise.
+//! A disturbance is a pure function of its size, a seed and the keyframes. Its effect on a keyframe does not depend on
+//! the order of the keyframes. With one seed, all sizes use the same random directions, so that random variation
+//! between sizes does not add noise to a curve.
 
 use crate::statistics::Interpolation;
 use keyframe::{Keyframe, Split};
@@ -20,7 +20,7 @@ use std::sync::Arc;
 pub enum Disturbance {
     /// Errors of the camera poses.
     PoseNoise,
-    /// The clock of the poses is offset from that of the images.
+    /// The clock of the poses is offset from the clock of the images.
     ClockOffset,
     /// The exposure changes in the middle of the capture.
     Exposure,
@@ -28,7 +28,7 @@ pub enum Disturbance {
     Keyframes,
 }
 
-/// Rotation that pose noise adds to a translation, degrees per millimeter: 5 degrees at 50 mm.
+/// Rotation noise per translation noise, degrees per millimeter: 5 degrees at 50 mm.
 const DEGREES_PER_MM: f64 = 0.1;
 
 impl Disturbance {
@@ -66,7 +66,7 @@ impl Disturbance {
         }
     }
 
-    /// Default sizes, in ascending order; for keyframes, this is from the largest disturbance to the smallest.
+    /// Default sizes, in ascending order. For keyframes, the smallest number is the largest disturbance.
     pub(crate) fn default_levels(self) -> &'static [f64] {
         match self {
             Self::PoseNoise => &[0.0, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0],
@@ -87,7 +87,7 @@ impl Disturbance {
     /// Applies the disturbance to keyframes.
     ///
     /// * `level`: size in [`Self::unit`].
-    /// * `nanos_per_sec`: a second in units of the keyframes' stamps; 1e9 unless stamps only count images.
+    /// * `nanos_per_sec`: length of a second in units of the stamps; 1e9 unless stamps only count images.
     pub(crate) fn apply(
         self,
         keyframes: &[Arc<Keyframe>],
@@ -201,7 +201,7 @@ fn at(trajectory: &Trajectory, nanos: f64) -> Option<(Transform, Option<Twist>)>
     Some((transform::interpolate(a, b, frac), twist))
 }
 
-/// Darkens the first half of the capture and brightens the second, by half of `step_ev` each, which preserves the mean.
+/// Darkens the first half of the capture and brightens the second, by half of `step_ev` each to preserve the mean.
 fn exposure_step(keyframes: &[Arc<Keyframe>], step_ev: f64) -> Vec<Arc<Keyframe>> {
     let mut stamps: Vec<Stamp> =
         keyframes.iter().filter(|keyframe| keyframe.split != Split::Test).map(|keyframe| keyframe.stamp).collect();
@@ -241,7 +241,7 @@ fn subsample(keyframes: &[Arc<Keyframe>], n: f64) -> Vec<Arc<Keyframe>> {
         if keyframe.split == Split::Test {
             return true;
         }
-        // Keeps the middle one of each of n equal segments.
+        // Keeps the keyframe in the middle of each of n equal segments.
         let before = (n_visited * fraction + 0.5).floor();
         n_visited += 1.0;
         (n_visited * fraction + 0.5).floor() > before
@@ -253,7 +253,7 @@ fn subsample(keyframes: &[Arc<Keyframe>], n: f64) -> Vec<Arc<Keyframe>> {
 mod tests {
     use super::*;
 
-    const TOLERANCE: f64 = 1e-9; // Rounding of products of poses near 1.
+    const TOLERANCE: f64 = 1e-9; // Rounding errors of products of poses with elements near 1.
 
     /// A camera that moves along a line and rotates: 0.1 m and 0.02 rad per keyframe, 10 keyframes per second, gray
     /// images.
@@ -371,7 +371,7 @@ mod tests {
     #[test]
     fn clock_offset_uses_poses_of_a_later_time() {
         let capture = capture(20);
-        // 50 ms is half the time to the next keyframe; 250 ms is beyond the end.
+        // 50 ms is half the time to the next keyframe. With 250 ms, the last keyframes are extrapolated.
         for (millis, n_keyframes) in [(50.0, 0.5), (200.0, 2.0), (250.0, 2.5), (-50.0, -0.5)] {
             let moved = Disturbance::ClockOffset.apply(&capture, millis, 1, 1e9);
             for (before, after) in trained(&capture).zip(trained(&moved)) {
@@ -384,7 +384,7 @@ mod tests {
                 );
             }
         }
-        // If stamps count images, the rate defines a second: 100 ms at 1 image per second with stamps 0.1 s apart.
+        // If stamps count images, the image rate defines a second: at 1 image per second, 100 ms is 0.1 images.
         let counted = Disturbance::ClockOffset.apply(&capture, 100.0, 1, 1e8);
         assert!((counted[1].world_from_camera.translation.x - 0.11).abs() < TOLERANCE);
         let alone = clock_offset(&capture[1..2], 1e8);

@@ -7,10 +7,10 @@ use session::Context;
 use session::OpenGpu;
 use trainer::nerf::bench::time_steps;
 
-/// Samples of a step if they are not given, on a GPU and on the CPU.
+/// Default samples per step, on a GPU and on the CPU.
 const DEFAULT_SAMPLES: [u32; 2] = [1 << 17, 1 << 18];
 const DEFAULT_SAMPLES_ON_CPU: [u32; 1] = [1 << 14];
-/// Timed steps if they are not given, on a GPU and on the CPU.
+/// Default number of timed steps, on a GPU and on the CPU.
 const DEFAULT_REPEATS: u32 = 100;
 const DEFAULT_REPEATS_ON_CPU: u32 = 3;
 
@@ -19,10 +19,10 @@ const DEFAULT_REPEATS_ON_CPU: u32 = 3;
 pub struct FieldOptions {
     /// Rays per step.
     pub n_rays: u32,
-    /// Samples per step, one row each; rounded down to a multiple of the rays, with at least one per ray. Empty: the
-    /// default ones.
+    /// Samples per step, one row for each value; the defaults if empty. Each value is rounded down to a multiple of the
+    /// rays, but at least one sample per ray.
     pub n_samples: Vec<u32>,
-    /// Number of timed steps, whose median is reported; 100, or 3 on the CPU, if `None`.
+    /// Number of timed steps, of which the median is reported. If `None`: 100, or 3 on the CPU.
     pub n_repeats: Option<u32>,
     /// Whether to report the GPU time of each pass.
     pub profile: bool,
@@ -39,7 +39,7 @@ pub struct FieldRow {
     pub step_millis: f64,
     /// Wall time of a step, milliseconds.
     pub step_wall_millis: f64,
-    /// Time to render as many samples of an image, milliseconds.
+    /// Time to render an image with the same number of samples, milliseconds.
     pub colors_millis: f64,
     /// Peak size of live GPU buffers, bytes.
     pub peak_bytes: u64,
@@ -48,9 +48,9 @@ pub struct FieldRow {
     pub passes: Vec<(&'static str, f64)>,
 }
 
-/// Measures one number of samples after the other.
+/// Measures a training step for each number of samples in turn.
 ///
-/// * `on_row`: takes each row; its error ends the bench.
+/// * `on_row`: receives each row. If it returns an error, the bench ends.
 ///
 /// # Errors
 ///
@@ -65,7 +65,7 @@ pub fn measure<E: From<Error>>(
     let n_samples = if options.n_samples.is_empty() { default_samples } else { &options.n_samples };
     let n_repeats = options.n_repeats.unwrap_or(if is_software { DEFAULT_REPEATS_ON_CPU } else { DEFAULT_REPEATS });
     for (row_ix, n_samples) in n_samples.iter().enumerate() {
-        // A new device for each row, so that the memory peak is that of the row.
+        // Each row uses a new device, so that the peak memory of earlier rows is not included.
         let gpu = open_gpu()?;
         if row_ix == 0 {
             log::info!("{}", gpu.describe());

@@ -1,4 +1,4 @@
-//! Memory of this process over time, and its growth rate once all bounded stores are full.
+//! Memory of this process over time, and its growth rate once the keyframe store is full.
 
 use crate::Result;
 use crate::statistics::theil_sen;
@@ -7,11 +7,11 @@ use kinematics::quantile::median;
 use serde::Serialize;
 use session::Context;
 
-/// Time after the keyframe store is full that is ignored, while buffers reach their final size.
+/// Time to ignore after the keyframe store is full, while buffers reach their final size.
 const SETTLE_SECS: f64 = 60.0;
-/// Minimum length of the time over which a rate is measured.
+/// Minimum time over which a rate is measured.
 const MIN_SPAN_SECS: f64 = 60.0;
-/// Maximum number of samples for a rate; more samples are reduced to the medians of this many groups.
+/// Maximum number of samples for a rate. More samples are reduced to medians of at most this many groups.
 const MAX_GROUPS: usize = 400;
 const SECS_PER_HOUR: f64 = 3600.0;
 
@@ -20,15 +20,15 @@ const SECS_PER_HOUR: f64 = 3600.0;
 pub struct Sample {
     /// Time since the first image.
     pub seconds: f64,
-    /// Resident memory of the process; on a software adapter this includes GPU memory.
+    /// Resident memory of the process. On a software adapter, it includes GPU memory.
     pub resident_bytes: u64,
     /// GPU buffers in use.
     pub gpu_bytes: u64,
-    /// Memory that the GPU allocator reserves for them, if the backend reports it.
+    /// Memory that the GPU allocator reserves for GPU buffers, if the backend reports it.
     pub gpu_reserved_bytes: Option<u64>,
-    /// Models, a part of `gpu_bytes`.
+    /// Size of the models, included in `gpu_bytes`.
     pub model_bytes: u64,
-    /// Images of keyframes on the GPU, a part of `gpu_bytes`.
+    /// Images of keyframes on the GPU, included in `gpu_bytes`.
     pub gpu_image_bytes: u64,
     /// Host memory of the keyframes.
     pub keyframe_bytes: u64,
@@ -40,11 +40,11 @@ pub struct Sample {
     pub step: u64,
     /// Number of connected viewers.
     pub viewers: usize,
-    /// Number of images that the viewers received.
+    /// Number of pictures that the viewers received.
     pub pictures: u64,
 }
 
-/// Which part of the resident memory is not counted.
+/// Part of the resident memory that is excluded from the growth rate.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Excluded {
     /// Nothing; GPU buffers are in separate memory.
@@ -66,7 +66,7 @@ impl Excluded {
     }
 }
 
-/// How fast memory grows once the keyframe store is full.
+/// Growth rate of memory once the keyframe store is full.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Growth {
     /// Whether the store was full; otherwise the second half of the run is measured.
@@ -117,7 +117,7 @@ impl Growth {
 ///
 /// # Errors
 ///
-/// If the system does not report it; only Linux does.
+/// If the system does not report the resident memory, which only Linux does.
 pub fn resident_bytes() -> Result<(u64, u64)> {
     const STATUS: &str = "/proc/self/status";
     let status = std::fs::read_to_string(STATUS)
@@ -183,7 +183,7 @@ mod tests {
         assert_eq!(
             Growth::of(&samples(200, |_| 1e9), Excluded::Model),
             None,
-            "40 s after the store was full and settled"
+            "only 40 s of samples after the settling time"
         );
         assert_eq!(Growth::of(&[], Excluded::Model), None);
     }

@@ -11,7 +11,7 @@ use trainer::splat::arrays::SplatArrays;
 use trainer::splat::bench::{Eye, KernelFigures, Repeats, time_kernels};
 use trainer::splat::cloud::{load_cloud_npz, synthetic_cloud};
 
-/// Settings if an option is not given.
+/// Values of options that are not given.
 struct Defaults {
     sizes_px: &'static [[u32; 2]],
     n_splats: &'static [u32],
@@ -24,7 +24,7 @@ const DEFAULTS: Defaults = Defaults {
     n_splats: &[100_000, 300_000, 1_000_000, 3_000_000],
     n_repeats: 30,
 };
-/// Defaults on the CPU, which needs seconds for what a GPU does in a millisecond, and supports only smaller buffers.
+/// Defaults on the CPU, which is about a thousand times slower than a GPU and supports only smaller buffers.
 const DEFAULTS_ON_CPU: Defaults = Defaults { sizes_px: &[[320, 240]], n_splats: &[10_000, 30_000], n_repeats: 3 };
 
 /// Options of [`measure`].
@@ -32,13 +32,13 @@ const DEFAULTS_ON_CPU: Defaults = Defaults { sizes_px: &[[320, 240]], n_splats: 
 pub struct KernelsOptions {
     /// An `.npz` file with splats; a synthetic cloud if `None`.
     pub cloud: Option<PathBuf>,
-    /// Image sizes, pixels; empty: the default ones.
+    /// Image sizes, pixels; the defaults if empty.
     pub sizes_px: Vec<[u32; 2]>,
-    /// Numbers of splats of the synthetic cloud; empty: the default ones.
+    /// Numbers of splats of the synthetic cloud; the defaults if empty.
     pub n_splats: Vec<u32>,
-    /// Number of timed images and steps, whose median is reported; 30, or 3 on the CPU, if `None`.
+    /// Number of timed images and steps, of which the median is reported. If `None`: 30, or 3 on the CPU.
     pub n_repeats: Option<u32>,
-    /// Whether the camera is inside the cloud, where it sees only some of the splats.
+    /// Whether the camera is inside the cloud, so that only some of the splats are visible.
     pub inside: bool,
     /// Whether to report the GPU time of each pass.
     pub profile: bool,
@@ -59,9 +59,9 @@ pub struct KernelsRow {
     pub passes: Vec<(&'static str, f64)>,
 }
 
-/// Measures every number of splats at one image size after the other.
+/// Measures every number of splats at every image size.
 ///
-/// * `on_row`: takes each row; its error ends the bench.
+/// * `on_row`: receives each row. If it returns an error, the bench ends.
 ///
 /// # Errors
 ///
@@ -87,7 +87,7 @@ pub fn measure<E: From<Error>>(
     let eye = if options.inside { Eye::Inside } else { Eye::Outside };
     for (size_ix, size_px) in sizes_px.iter().enumerate() {
         for n_splats in &counts {
-            // A new device for each row, so that the memory peak is that of the row.
+            // Each row uses a new device, so that the peak memory of earlier rows is not included.
             let gpu = open_gpu()?;
             if size_ix == 0 && counts.first() == Some(n_splats) {
                 log::info!("{}", gpu.describe());

@@ -1,9 +1,9 @@
 //! The experiments of `fieldrig bench`: they train many models, or measure a part of the program, and draw charts.
 //!
-//! Benches that train ([`curve`], [`budget`], [`ablation`] and [`stability`]) save each run to a file when it ends, so
-//! that a bench continued in the same folder does not repeat it. [`kernels`] and [`field`] measure the speed of the
-//! trainer, [`stamps`] the errors of image stamps, [`live`] evaluates a live run with viewers, and [`memory`] samples of
-//! the memory of a long run. The results are [`Findings`]: JSON with every number, charts, and a page.
+//! [`curve`], [`budget`], [`ablation`] and [`stability`] train models. They save each finished run to a file, so that a
+//! bench restarted in the same folder does not repeat it. [`kernels`] and [`field`] measure training speed, [`stamps`]
+//! the errors of image stamps, [`live`] a live run with viewers, and [`memory`] the memory of a long run. The results
+//! are [`Findings`]: JSON with every number, charts, and a page.
 //!
 //! The caller opens the GPU, requests stops and receives reports ([`Host`], [`BenchObserver`]).
 //!
@@ -50,6 +50,6 @@ pub use disturb::Disturbance;
 pub use findings::{BenchResult, Findings};
 pub use growth::{Excluded, Growth, Sample, resident_bytes};
 pub use runs::{BenchObserver, Disturbed, Host, Run, RunReport, RunScores, RunSettings, RunsOptions};
-// Benches fail where sessions and files do, so their errors have the same causes and classes.
+// Errors of benches come from sessions and files, so benches use the error type of `session`.
 pub use session::{Error, Result};
 pub use viewer::{ReceivedPicture, Viewer, ViewerOptions};

@@ -1,5 +1,5 @@
-//! A live run as an operator sees it: latency of pictures and of keyframes, training speed, and accuracy over time, with
-//! correct and with wrong calibration.
+//! Measures a live run: latency of pictures and keyframes, training speed, and accuracy over time, with correct and
+//! wrong calibration.
 //!
 //! All times are on the clock of this process, from mid-exposure of an image to the arrival of a picture at its viewer.
 
@@ -25,12 +25,12 @@ pub struct HandEyeError {
     pub degrees: f64,
     /// Translation, millimeters.
     pub millimeters: f64,
-    /// Selects the random directions of both.
+    /// Seed of the random directions of rotation and translation.
     pub seed: u64,
 }
 
 impl HandEyeError {
-    /// Moves all cameras on the flange: each by the same error, in its own frame.
+    /// Applies the error to all cameras on the flange, for each camera in its own frame.
     pub fn apply(self, rig: &mut Rig) {
         let mut random = Random::new(self.seed);
         let mut direction = || UnitVector3::new_normalize(Vector3::from_fn(|_, _| random.normal()));
@@ -107,7 +107,7 @@ pub struct LiveRun {
 }
 
 impl LiveRun {
-    /// Evaluates a run that is over, before its viewers disconnect.
+    /// Collects the measurements of a run that is over.
     #[must_use]
     pub fn of(conditions: Conditions, live: &Live, viewers: &[Viewer]) -> Self {
         let session = &live.sessions()[0];
@@ -136,7 +136,7 @@ impl LiveRun {
     }
 }
 
-/// The durations of all pictures, and those of all keyframes up to the first viewer.
+/// Latencies of all pictures, and of all keyframes until the first viewer receives them in a picture.
 fn latencies(pictures: &[Vec<ReceivedPicture>], keyframes: &[KeyframeTimes]) -> Vec<(&'static str, Latency)> {
     let of_pictures =
         |name, millis: fn(&ReceivedPicture) -> f64| (name, Latency::of(pictures.iter().flatten().map(millis)));
@@ -165,7 +165,7 @@ fn latencies(pictures: &[Vec<ReceivedPicture>], keyframes: &[KeyframeTimes]) -> 
     named.into_iter().filter_map(|(name, latency)| Some((name, latency?))).collect()
 }
 
-/// For each keyframe, the time from mid-exposure until the viewer had the first picture that contains it, milliseconds.
+/// For each keyframe, the time from mid-exposure to the arrival of the first picture that contains it, milliseconds.
 fn shutter_to_picture<'a>(
     pictures: &'a [ReceivedPicture],
     keyframes: &'a [KeyframeTimes],
@@ -221,7 +221,7 @@ pub fn findings(input: &str, runs: &[LiveRun]) -> Findings {
         title: "Live run".to_owned(),
         sentences: vec![
             format!("{input}. Durations are medians / 99th percentiles."),
-            "A keyframe is in the model from the first step after it was added. The shutter is the middle of the exposure."
+            "A picture contains a keyframe if the model took a step after the keyframe was added. Shutter times are mid-exposure."
                 .to_owned(),
         ],
         charts: vec![(
@@ -280,7 +280,7 @@ mod tests {
     }
 
     #[test]
-    fn keyframes_are_seen_in_the_first_picture_that_contains_them() {
+    fn latency_ends_at_the_first_picture_with_the_keyframe() {
         let began = Instant::now();
         let keyframes = [keyframe(began, 0), keyframe(began, 10), keyframe(began, 100), keyframe(began, 200)];
         let pictures = [picture(began, 0, 20, 0), picture(began, 20, 50, 2), picture(began, 50, 130, 3)];

@@ -38,7 +38,7 @@ pub struct MemoryRun {
 }
 
 impl MemoryRun {
-    /// Adds a sample of a run in progress and of its viewers.
+    /// Samples the memory of a run in progress, adds the sample, and returns it.
     ///
     /// # Errors
     ///
@@ -64,7 +64,7 @@ impl MemoryRun {
         Ok(sample)
     }
 
-    /// The growth rates, a chart of the components, and the largest buffers.
+    /// Growth rates, a chart of the components, and the largest GPU buffers.
     ///
     /// # Errors
     ///
@@ -82,7 +82,7 @@ impl MemoryRun {
         .collect();
         let rate = growths.first().map_or("too short to measure a growth rate".to_owned(), |(name, growth)| {
             let since = if growth.store_was_full { "with a full keyframe store" } else { "in the second half" };
-            format!("{:+.2} % per hour {name} {since}", growth.percent_per_hour)
+            format!("memory growth {name} {since}: {:+.2} % per hour", growth.percent_per_hour)
         });
         let conditions = format!("{}, {}", self.input, counted(self.n_viewers, "viewer"));
         let lines: Vec<Line> = COMPONENTS
@@ -125,9 +125,9 @@ impl MemoryRun {
             title: "Memory of a long run".to_owned(),
             sentences: vec![
                 format!("{conditions}: {rate}."),
-                "Growth is that of resident memory from one minute after the keyframe store is full: the median of the rates of change between \
-                 all pairs of samples. On a software adapter, resident memory includes GPU buffers; the model, and the working memory of \
-                 training, which grows with the model, are subtracted."
+                "Growth is the median rate of change of resident memory between all pairs of samples, starting one minute after the keyframe \
+                 store is full. On a software adapter, resident memory includes GPU buffers. The model and the working memory of training, \
+                 which grows with the model, are then subtracted."
                     .to_owned(),
             ],
             charts: vec![(
@@ -177,7 +177,7 @@ const COMPONENTS: [MemoryComponent; 6] = [
     MemoryComponent { label: "reserved for GPU buffers", bytes: |sample| sample.gpu_reserved_bytes },
 ];
 
-/// The median and range of each group of samples.
+/// The line of one component: median and range of each group of samples.
 fn line(component: &MemoryComponent, samples: &[Sample]) -> Line {
     let of_group = |group: &[Sample]| {
         let mut mb: Vec<f64> =
@@ -222,10 +222,11 @@ mod tests {
         );
         measured.samples.iter_mut().for_each(|sample| sample.model_bytes = sample.resident_bytes - 900_000_000);
         let findings = measured.findings().expect("numbers");
-        assert!(findings.sentences[0].contains("+0.00 % per hour without the model"), "{}", findings.sentences[0]);
+        assert!(findings.sentences[0].contains("without the model with a full"), "{}", findings.sentences[0]);
+        assert!(findings.sentences[0].contains("+0.00 % per hour"), "{}", findings.sentences[0]);
         assert_eq!(findings.tables[1].rows[0][0], "large");
         let chart = &findings.charts[0].1;
-        assert_eq!(chart.lines.len(), 5, "the reserved memory is unknown");
+        assert_eq!(chart.lines.len(), 5, "no line for the unknown reserved memory");
         assert!(chart.lines.iter().all(|line| line.points.len() <= MAX_POINTS), "{}", chart.lines[0].points.len());
         assert_eq!(chart.markers[0].label, "store full: 100 keyframes");
         assert_eq!(findings.numbers["samples"].as_array().map(Vec::len), Some(600));

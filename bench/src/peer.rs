@@ -1,4 +1,4 @@
-//! Curves measured with other trainers: JSON with `rows` of `seconds` and `psnr`.
+//! Reads curves measured with other trainers: JSON with `rows` of `seconds` and `psnr`.
 
 use crate::{Error, Result};
 use serde::Deserialize;

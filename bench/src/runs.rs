@@ -1,5 +1,5 @@
-//! The runs of a bench. Each is trained once and saved to a file, so that a bench continued in the same folder does not
-//! repeat it.
+//! The runs of a bench. Each run is trained once and saved to a file, so that a bench restarted in the same folder does
+//! not repeat it.
 
 use crate::{Error, Result};
 use capture::Stop;
@@ -34,12 +34,12 @@ pub struct RunsOptions {
     pub out: Option<PathBuf>,
 }
 
-/// What the program that runs a bench provides.
+/// Services of the program that runs a bench.
 #[derive(Clone)]
 pub struct Host<'a> {
-    /// Opens the GPU, and opens it again after it was lost.
+    /// Opens the GPU, also after it was lost.
     pub open_gpu: OpenGpu,
-    /// Requests that the bench stops.
+    /// Stops the bench when requested.
     pub stop: Stop,
     /// Receives the reports.
     pub observer: &'a dyn BenchObserver,
@@ -47,11 +47,11 @@ pub struct Host<'a> {
 
 /// Receives the reports of a bench that trains, for example to print them.
 pub trait BenchObserver {
-    /// Returns a function that takes the progress of reading one data set. It is dropped after the last image.
+    /// Returns a callback for the progress of reading one data set. The callback is dropped after the last image.
     fn reading(&self) -> Box<dyn Fn(ReadProgress) + Sync>;
     /// Returns the observer of the training session of one run with these limits.
     fn training(&self, limits: Limits) -> Box<dyn Observer>;
-    /// Takes a finished run.
+    /// Receives the report of a finished run.
     fn on_run(&self, report: &RunReport<'_>);
 }
 
@@ -68,20 +68,20 @@ impl BenchObserver for () {
     fn on_run(&self, _report: &RunReport<'_>) {}
 }
 
-/// Report of a finished run. Serialized, it is the event `run`.
+/// Report of a finished run, serialized as the event `run`.
 #[derive(Clone, Debug, Serialize)]
 pub struct RunReport<'a> {
     event: &'static str,
-    /// Whether it was trained by an earlier bench.
+    /// Whether the run was read from a file instead of trained.
     #[serde(rename = "cached")]
     pub is_cached: bool,
     /// The run.
     #[serde(flatten)]
     pub run: &'a Run,
-    /// Number of runs of this bench that are finished, including this one.
+    /// Number of finished runs of this bench, including this one.
     #[serde(skip)]
     pub n_done: u64,
-    /// Number of all runs of this bench.
+    /// Total number of runs of this bench.
     #[serde(skip)]
     pub n_all: u64,
 }
@@ -95,7 +95,7 @@ pub struct RunSettings {
     pub method: String,
     /// Random seed.
     pub seed: u64,
-    /// `None` if the method has no such limit.
+    /// Maximum number of splats; `None` if the method has no such limit.
     pub max_splats: Option<u64>,
     /// Maximum GPU memory of the model, bytes; `None`: no limit.
     pub max_bytes: Option<u64>,
@@ -109,11 +109,11 @@ pub struct RunSettings {
     pub holdout: Option<String>,
     /// List of the keyframes to use.
     pub keyframes: Option<PathBuf>,
-    /// Number of training images if nothing is disturbed.
+    /// Number of training images before any disturbance.
     pub n_train: usize,
     /// Number of test images.
     pub n_test: usize,
-    /// Disturbance of the training images, if any.
+    /// Disturbance of the keyframes, if any.
     pub disturbed: Option<Disturbed>,
     /// Name of the variant of the trainer.
     pub variant: Option<String>,
@@ -123,7 +123,7 @@ pub struct RunSettings {
     pub version: String,
 }
 
-/// Disturbance of the training keyframes.
+/// Disturbance of the keyframes of a run.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Disturbed {
     /// Name of the disturbance.
@@ -143,7 +143,7 @@ pub struct RunScores {
     pub seconds: f64,
     /// Number of optimizer steps.
     pub step: u64,
-    /// Mean PSNR of the test images, dB; also unknown if it is infinite.
+    /// Mean PSNR of the test images, dB; `None` also if it is infinite.
     pub psnr: Option<f64>,
     /// Mean SSIM of the test images.
     pub ssim: Option<f64>,
@@ -171,7 +171,7 @@ pub struct Run {
 }
 
 impl Run {
-    /// Final test PSNR, dB; 99 for an image without errors, whose PSNR is infinite.
+    /// Final test PSNR, dB; 99 if it is infinite, because renders and images are identical.
     #[must_use]
     pub fn psnr(&self) -> f64 {
         const WITHOUT_ERROR_DB: f64 = 99.0;
@@ -181,7 +181,7 @@ impl Run {
     /// Points `(seconds, dB)` at the evaluations and at the end.
     #[must_use]
     pub fn curve(&self) -> Vec<(f64, f64)> {
-        /// An end this close after the last evaluation is not a separate point.
+        /// Minimum ratio of the end to the last evaluation for the end to be a separate point.
         const MIN_SECONDS_RATIO: f64 = 1.02;
         let is_new = self.evaluations.last().is_none_or(|last| self.end.seconds > MIN_SECONDS_RATIO * last.seconds);
         let points = self.evaluations.iter().chain(is_new.then_some(&self.end));
@@ -206,9 +206,9 @@ pub(crate) struct Job<'a> {
     pub(crate) limits: Limits,
     pub(crate) disturbed: Option<Disturbed>,
     pub(crate) variant: Option<String>,
-    /// Returns the keyframes; called only if the run is not saved yet.
+    /// Returns the keyframes. Called only if the run is not saved yet.
     pub(crate) keyframes: &'a dyn Fn() -> Vec<Arc<Keyframe>>,
-    /// Whether every evaluation computes all scores; otherwise only the final one does, and the others compute PSNR.
+    /// Whether scheduled evaluations compute all scores instead of PSNR only. The final evaluation computes all scores.
     pub(crate) is_thorough: bool,
 }
 
@@ -228,7 +228,7 @@ impl NamedData {
     ///
     /// # Errors
     ///
-    /// If there are several.
+    /// If there are several methods.
     pub(crate) fn single_model_spec(&self) -> Result<&ModelSpec> {
         match &self.model_specs[..] {
             [one] => Ok(one),
@@ -240,11 +240,11 @@ impl NamedData {
         }
     }
 
-    /// The training options of splats, for a bench of splats.
+    /// The training options of splats, for a bench that measures splats only.
     ///
     /// # Errors
     ///
-    /// If the method is another one.
+    /// If another method, or several methods, are selected.
     pub(crate) fn splats(&self) -> Result<ModelOptions<SplatOptions>> {
         let options = match &self.model_specs[..] {
             [one] => one.options_of()?,
@@ -315,7 +315,7 @@ impl<'a> Runs<'a> {
         Ok(NamedData { name: unique_name(path, used_names), path: path.to_owned(), data, model_specs })
     }
 
-    /// Returns the run of a job, from its file or trained now and saved.
+    /// Returns the run of a job from its file. If there is none, trains the run and saves it.
     pub(crate) fn run(&mut self, job: Job<'_>) -> Result<Run> {
         self.n_done += 1;
         let settings = self.settings(&job);
@@ -380,7 +380,7 @@ impl<'a> Runs<'a> {
         )?;
         ensure!(
             session.is_over() || !self.host.stop.requested(),
-            "stopped early; the same command with --out {} continues the bench",
+            "stopped early; to continue the bench, run the same command with --out {}",
             self.out.display()
         );
         session.score_without_saving()
@@ -445,7 +445,7 @@ fn difference(cached: &RunSettings, requested: &RunSettings) -> Result<Option<St
         .map(|(key, value)| format!("{key} ({} saved, {value} now)", cached[key.as_str()])))
 }
 
-/// A name for data from its path, with a number if it is already used.
+/// Derives a name for data from its path, with a number if the name is already used.
 fn unique_name(path: &Path, used_names: &mut HashSet<String>) -> String {
     let canonical = path.canonicalize().unwrap_or_else(|_| path.to_owned());
     let stem = if canonical.is_dir() { canonical.file_name() } else { canonical.file_stem() };

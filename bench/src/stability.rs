@@ -19,10 +19,10 @@ use trainer::{ModelOptions, ModelSpec};
 
 /// Training time of a run if no flag limits it.
 const DEFAULT_SECONDS: f64 = 30.0;
-/// Losses of PSNR whose disturbance level is reported, dB.
+/// Losses of PSNR for which the size of the disturbance is reported, dB.
 const BREAKS_DB: [f64; 2] = [1.0, 3.0];
 const NANOS_PER_SEC: f64 = 1e9;
-/// Nanoseconds between consecutive images whose stamps only count them.
+/// Difference between consecutive stamps that only count images, nanoseconds.
 const NANOS_PER_COUNT: f64 = 1e6;
 
 /// All variants are trained on the same disturbed data; each gives one line per chart.
@@ -33,11 +33,11 @@ const VARIANTS: &[Variant] = &[Variant { name: "with --refine", change: |_| () }
 pub struct StabilityOptions {
     /// Folder or recording.
     pub data: PathBuf,
-    /// What to disturb, without duplicates.
+    /// Disturbances to measure, without duplicates.
     pub disturbances: Vec<Disturbance>,
-    /// Whether a clock offset is skipped, rather than an error, if the images have no times.
+    /// If the images have no times: whether a clock offset is skipped instead of rejected.
     pub can_skip_clock_offset: bool,
-    /// Sizes of a single disturbance, in its unit; empty: the default ones.
+    /// Sizes of a single disturbance, in its unit; the defaults if empty.
     pub levels: Vec<f64>,
     /// Images per second, for images without times.
     pub rate_hz: Option<f64>,
@@ -51,7 +51,7 @@ pub struct StabilityOptions {
     pub runs: RunsOptions,
 }
 
-/// Measurements to make of one disturbance.
+/// Planned measurements of one disturbance.
 struct DisturbancePlan {
     disturbance: Disturbance,
     /// Sizes, starting with the undisturbed data.
@@ -88,7 +88,7 @@ struct Level {
     runs: Vec<Run>,
 }
 
-/// Size at which the PSNR has fallen by `drop_db` from the undisturbed one; `None` if none of the sizes reaches it.
+/// Size at which the PSNR has fallen by `drop_db` from the undisturbed PSNR; `None` if it does not fall that far.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 struct Break {
     drop_db: f64,
@@ -123,7 +123,7 @@ pub fn run(options: &StabilityOptions, host: &Host<'_>) -> Result<BenchResult> {
             for level in &plan.levels {
                 let finished = measure(options, &mut runs, &data, limits, plan, variant, *level)?;
                 curve.add(plan.disturbance, *level, finished);
-                // Written after every size, so that an interrupted bench leaves results.
+                // Findings are written after every size, so that an interrupted bench leaves results.
                 let variants = &mut results.last_mut().expect("pushed above").variants;
                 variants.retain(|curve| curve.name != variant.name);
                 variants.push(curve.clone());
@@ -202,7 +202,7 @@ fn disturb(
     if is_undisturbed { keyframes.to_vec() } else { plan.disturbance.apply(keyframes, level, seed, plan.nanos_per_sec) }
 }
 
-/// Number of training images if nothing is disturbed.
+/// Number of training images before any disturbance.
 fn n_train(data: &NamedData) -> usize {
     data.data.keyframes.iter().filter(|keyframe| keyframe.split != Split::Test).count()
 }
@@ -230,7 +230,7 @@ impl StabilityOptions {
         Ok(())
     }
 
-    /// The measurements to make. A clock offset without image times is an error, or is skipped for `all`.
+    /// Plans the measurements. If images have no times, a clock offset is an error, or is skipped for `all`.
     fn plans(&self, data: &NamedData) -> Result<Vec<DisturbancePlan>> {
         let mut selected = self.disturbances.clone();
         let (nanos_per_sec, rate_hz) = match (data.data.has_times, self.rate_hz) {
@@ -356,7 +356,7 @@ fn describe(disturbance: Disturbance) -> &'static str {
     }
 }
 
-/// Formats a level with two or three significant digits; a single curve does not support more.
+/// Formats a level with few digits, because a break point is not more precise.
 fn significant_digits(level: f64) -> String {
     match level {
         level if level >= 10.0 => format!("{level:.0}"),
@@ -406,7 +406,7 @@ fn findings(
         title: format!("Stability: {}", data.name),
         sentences: vec![
             format!(
-                "Each point is a model trained for {length} on disturbed images and scored on undisturbed test images. A break point is the size at which the PSNR has fallen by 1 or 3 dB from the undisturbed one."
+                "Each point is a model trained for {length} on disturbed images and scored on test images. Only a clock offset and an exposure step also disturb the test images. A break point is the size at which the PSNR has fallen by 1 or 3 dB from the undisturbed PSNR."
             ),
             "Pose noise also rotates each camera, by 0.1 degrees per millimeter. Poses with a clock offset are interpolated between neighboring images. An exposure step darkens the first half of the capture and brightens the second, by half the step each."
                 .into(),

@@ -1,4 +1,4 @@
-//! Measures the stamp errors of images from a camera with its own clock and a link with jitter.
+//! Measures stamp errors of images from a simulated camera that has its own clock and a connection with jitter.
 
 use crate::findings::{BenchResult, Findings};
 use crate::{Error, Result};
@@ -14,11 +14,11 @@ use std::time::Duration;
 
 /// Width of a histogram bin, milliseconds.
 const BIN_MILLIS: f64 = 0.1;
-/// Range of the histogram to either side, milliseconds; errors beyond it count in the outermost bins.
+/// Range of the histogram to either side, milliseconds. Larger errors are counted in the outermost bins.
 const HISTOGRAM_RANGE_MILLIS: f64 = 8.0;
 /// Joint states per second.
 const JOINT_RATE_HZ: u32 = 1000;
-/// Speed of the joint, rad/s. Its angle encodes the time.
+/// Speed of the joint, rad/s. The joint angle encodes the time.
 const SPEED_RAD_S: f64 = 1.0;
 /// Error up to which a stamp counts as correct.
 const MAX_ERROR_MILLIS: f64 = 1.0;
@@ -36,7 +36,7 @@ pub struct StampsOptions {
     pub drift_ppm: f64,
     /// Length of a run, 1 to 3600 s.
     pub seconds: f64,
-    /// Time at the start of a run that is not counted; at least half a second less than `seconds`.
+    /// Time at the start of a run that is ignored; at least half a second less than `seconds`.
     pub settle_seconds: f64,
     /// Runs per rate.
     pub seeds: u64,
@@ -49,7 +49,7 @@ pub struct StampsOptions {
 pub struct StampErrors {
     /// Images per second.
     pub rate_hz: f64,
-    /// Whether the rig file corrects the fixed latency.
+    /// Whether the rig file corrects the fixed latency of images.
     pub is_calibrated: bool,
     /// Number of images.
     pub images: usize,
@@ -116,8 +116,8 @@ fn check(options: &StampsOptions) -> Result<()> {
     }
 }
 
-/// For each image after the settling time, the time of the pose that the join assigns to it minus the time of its
-/// shutter. The fixed latency is included.
+/// The stamp error of each image after the settling time: time of the joint state at its stamp, minus time of its
+/// shutter. Includes the fixed latency.
 #[expect(clippy::cast_possible_truncation, reason = "times of an hour at most, in nanoseconds")]
 fn errors_millis(options: &StampsOptions, rate_hz: f64, seed: u64) -> Vec<f64> {
     let mut random = Random::new(seed);
@@ -214,20 +214,20 @@ fn findings(options: &StampsOptions, results: &[StampErrors]) -> Result<Findings
             format!("{:.3}", results.max_abs_millis),
         ]
     };
-    let head = ["camera", "images", "within 1 ms, %", "median, ms", "99 % within, ms", "maximum, ms"];
+    let head = ["camera", "images", "within 1 ms, %", "median, ms", "99th percentile, ms", "maximum, ms"];
     Ok(Findings {
         name: "stamps",
         title: "Errors of image stamps".to_owned(),
         sentences: vec![
             format!("{conditions}."),
-            "A joint moves at 1 rad/s and is read 1000 times per second; its angle at the stamp of an image gives the error of that stamp. \
- A fixed latency cannot be detected from stamps: it must be in the rig file (stamp_to_mid_exposure_millis); otherwise it remains, and a warning is logged."
+            "A joint moves at 1 rad/s and is read 1000 times per second. Its angle at the stamp of an image gives the error of that stamp. \
+ A fixed latency cannot be detected from stamps. It remains, with a warning, unless the rig file contains it (stamp_to_mid_exposure_millis)."
                 .to_owned(),
         ],
         charts: vec![(
             "",
             Chart {
-                title: "Error of the stamp at which the pose is taken".to_owned(),
+                title: "Errors of image stamps".to_owned(),
                 subtitle: conditions,
                 x: Axis { label: "ms".to_owned(), scale: Scale::Linear, ticks: Vec::new() },
                 y: Axis { label: "share of images, % per 0.1 ms".to_owned(), scale: Scale::Linear, ticks: Vec::new() },

@@ -29,10 +29,10 @@ pub(crate) fn secs_to(curve: &[(f64, f64)], target_db: f64) -> Option<f64> {
     Some(previous_secs * (secs / previous_secs).powf(frac))
 }
 
-/// Rate of change of `(x, y)` by the Theil-Sen estimator (Sen 1968): the median of the rates between all pairs. `None` with fewer than two values of
-/// x.
+/// Slope of a line through `(x, y)` by the Theil-Sen estimator: the median of the slopes between all pairs of points,
+/// which is robust to outliers. `None` with fewer than two values of x.
 ///
-/// Source: Theil 1950, Sen 1968. A few outliers do not change it.
+/// Source: Theil 1950, Sen 1968.
 pub(crate) fn theil_sen(points: &[(f64, f64)]) -> Option<f64> {
     let pairs = points.iter().enumerate().flat_map(|(ix, from)| points[ix + 1..].iter().map(move |to| (from, to)));
     let rates: Vec<f64> =
@@ -62,10 +62,11 @@ pub(crate) fn break_point(curve: &[(f64, f64)], drop_db: f64, interpolation: Int
     })
 }
 
-/// Growth of a count below which the gain per doubling would mostly be noise.
+/// Minimum growth of a count; for less growth, the gain per doubling would be mostly noise.
 const MIN_GROWTH: f64 = 1.05;
 
-/// Gain per doubling of the count between two points `(count, dB)`; `None` if the count hardly grew.
+/// Gain per doubling of the count between two points `(count, dB)`; `None` if the count grew by less than
+/// [`MIN_GROWTH`].
 pub(crate) fn db_per_doubling(fewer: (f64, f64), more: (f64, f64)) -> Option<f64> {
     let growth = more.0 / fewer.0;
     (growth >= MIN_GROWTH).then(|| (more.1 - fewer.1) / growth.log2())
@@ -75,7 +76,7 @@ pub(crate) fn db_per_doubling(fewer: (f64, f64), more: (f64, f64)) -> Option<f64
 mod tests {
     use super::*;
 
-    const TOLERANCE: f64 = 1e-12; // Rounding of a few operations on numbers near 1.
+    const TOLERANCE: f64 = 1e-12; // Rounding errors of a few operations on numbers near 1.
 
     fn assert_close(got: Option<f64>, expected: f64) {
         assert!(
@@ -85,7 +86,7 @@ mod tests {
     }
 
     #[test]
-    fn extents_of_some_and_no_numbers() {
+    fn extent_of_nothing_is_none() {
         assert_eq!(extent(&[4.0, 1.0, 3.0]), Some([1.0, 4.0]));
         assert_eq!(extent(&[]), None);
     }
@@ -117,7 +118,7 @@ mod tests {
     }
 
     #[test]
-    fn gain_per_doubling() {
+    fn gain_per_doubling_needs_a_growing_count() {
         assert_close(db_per_doubling((1000.0, 20.0), (4000.0, 23.0)), 1.5);
         assert_close(db_per_doubling((1000.0, 20.0), (2000.0, 19.5)), -0.5);
         assert_eq!(db_per_doubling((1000.0, 20.0), (1000.0, 21.0)), None);

@@ -3,7 +3,7 @@
 use calibration::CameraRefinement;
 use trainer::ModelOptions;
 
-/// A named change of the training options of a method, or of any method.
+/// A named change of training options: of one method with options `S`, or of any method by default.
 pub(crate) struct Variant<S = serde_json::Value> {
     pub(crate) name: &'static str,
     pub(crate) change: fn(&mut ModelOptions<S>),
@@ -19,7 +19,7 @@ impl<S: Clone> Variant<S> {
         },
     };
 
-    /// The options `base` with this change.
+    /// The options `base` with this change applied.
     pub(crate) fn options(&self, base: &ModelOptions<S>) -> ModelOptions<S> {
         base.clone().with(self.change)
     }

@@ -1,6 +1,6 @@
 //! A viewer for benches: a WebSocket client that requests images back to back and discards them.
 //!
-//! It runs in the measured process, so it reads through one small buffer.
+//! It runs in the measured process. To affect the measurement little, it reads through one small buffer.
 
 use crate::Result;
 use keyframe::{ensure, failed};
@@ -17,7 +17,7 @@ use std::time::{Duration, Instant};
 
 /// Angle between two views on the circle around the scene, radians.
 const STEP_RAD: f64 = 0.05;
-/// The connection counts as dead after this long without a byte: the server sends its status several times a second.
+/// Read timeout of the connection. The server sends its status several times per second.
 const MAX_SILENCE: Duration = Duration::from_secs(120);
 /// Maximum length of a text message; the list of keyframes is the longest.
 const MAX_TEXT_BYTES: u64 = 16 << 20;
@@ -45,22 +45,22 @@ impl Default for ViewerOptions {
     }
 }
 
-/// A complete picture as its viewer saw it.
+/// Times of a complete picture, as measured by its viewer and the server.
 #[derive(Clone, Copy, Debug)]
 pub struct ReceivedPicture {
-    /// It was requested.
+    /// Time of the request.
     pub requested: Instant,
-    /// Its first stage was complete.
+    /// Time at which the first stage was received.
     pub first_stage: Instant,
-    /// Its last stage was complete.
+    /// Time at which the last stage was received.
     pub complete: Instant,
-    /// Time from the arrival of the request at the server until its last stage began to be rendered, milliseconds.
+    /// Time from the arrival of the request at the server to the start of rendering the last stage, milliseconds.
     pub waited_millis: f64,
     /// Time for rendering the last stage, milliseconds.
     pub render_millis: f64,
     /// Time for encoding the last stage, milliseconds.
     pub encode_millis: f64,
-    /// Number of keyframes, since the start of the run, that the model had taken a step with.
+    /// Number of keyframes, since the start of the run, that the model had been trained on.
     pub n_keyframes: u64,
 }
 
@@ -98,7 +98,7 @@ impl Viewer {
         Ok(Self { stream, pictures, thread: Some(thread.context("cannot start a thread")?) })
     }
 
-    /// Number of complete images received so far.
+    /// Number of complete pictures received so far.
     #[must_use]
     pub fn n_pictures(&self) -> u64 {
         self.pictures.lock().len() as u64
@@ -110,7 +110,7 @@ impl Viewer {
         self.pictures.lock().clone()
     }
 
-    /// Whether it still receives.
+    /// Whether the viewer is still connected.
     #[must_use]
     pub fn is_connected(&self) -> bool {
         self.thread.as_ref().is_some_and(|thread| !thread.is_finished())
@@ -133,9 +133,9 @@ struct Client {
     options: ViewerOptions,
     pictures: Arc<Mutex<Vec<ReceivedPicture>>>,
     n_requested: u64,
-    /// When the current picture was requested.
+    /// Time at which the current picture was requested.
     requested: Instant,
-    /// When its first stage was complete.
+    /// Time at which its first stage was received.
     first_stage: Option<Instant>,
     /// Center of the scene in world.
     center_m: Point3<f64>,
@@ -187,7 +187,7 @@ impl Client {
                 self.center_m = Point3::new(number(&center[0])?, number(&center[1])?, number(&center[2])?);
                 self.radius_m = number(&message["radius_m"])?;
             }
-            // There is no image yet.
+            // The server cannot draw a picture yet.
             Some("error") => {
                 std::thread::sleep(Duration::from_millis(200));
                 self.request_picture()?;
@@ -231,7 +231,7 @@ impl Client {
         let (is_panorama, size_px) = (self.options.is_panorama, self.options.size_px);
         let distance_m = if is_panorama { 0.2 } else { 1.5 } * self.radius_m;
         let offset = Vector3::new(angle.cos(), angle.sin(), 0.7) * distance_m;
-        // `face_towards` has z forward and y up, but a camera's y axis points down.
+        // The y axis of `face_towards` points up, but that of a camera points down.
         let world_from_camera = Transform::face_towards(&(self.center_m + offset), &self.center_m, &-Vector3::z());
         let request = json!({
             "type": "render",
@@ -278,7 +278,7 @@ impl Client {
         Ok(())
     }
 
-    /// Sends a frame. Its mask is zero: the protocol requires one, but on loopback there is no proxy to protect.
+    /// Sends a frame. The protocol requires a mask; it is zero, because there is no proxy to protect on loopback.
     fn send(&mut self, opcode: u8, contents: &[u8]) -> Result<()> {
         let mut frame = vec![0x80 | opcode];
         match u8::try_from(contents.len()) {

@@ -1,8 +1,8 @@
 //! Fuzz target for model files: splats in `.ply` and `.spz`, and training checkpoints. The crate `trainer` is not
 //! linked, to keep the build fast.
 //!
-//! The first byte selects the kind of the rest: a complete `.ply`, the uncompressed contents of a `.spz`, a complete
-//! `.spz`, or a checkpoint without its checksum.
+//! The first byte selects the format of the other bytes: a complete `.ply`, the uncompressed contents of a `.spz`, a
+//! complete `.spz`, or a checkpoint without its checksum.
 #![no_main]
 #![allow(dead_code, reason = "only reading is tested here")]
 
@@ -24,7 +24,7 @@ use sha2::Digest;
 use std::io::Write;
 use std::path::PathBuf;
 
-/// The errors used by these files. Those of the trainer also include GPU errors.
+/// The errors that these files use. The error type of the trainer also has GPU errors.
 #[derive(Debug)]
 pub enum Error {
     Read { path: PathBuf, source: std::io::Error },
@@ -35,7 +35,7 @@ pub enum Error {
     SplatArrays(String),
 }
 
-/// Writes a file in memory, which is overwritten for each input.
+/// Writes a file in memory; each input overwrites it.
 fn file(bytes: &[u8]) -> PathBuf {
     let path = PathBuf::from(format!("/dev/shm/fieldrig-model-{}", std::process::id()));
     std::fs::write(&path, bytes).expect("writing a small file");
@@ -62,7 +62,7 @@ libfuzzer_sys::fuzz_target!(|bytes: &[u8]| {
     };
     let Ok(splats) = splats else { return };
     let path = file(&[]);
-    // A format may reject positions outside of its range. Everything else must be read back.
+    // A format may reject positions outside its range. Every file that is written must be readable.
     for (write, read) in [(ply::write as fn(_, _) -> _, ply::read as fn(_) -> _), (spz::write, spz::read)] {
         if write(&path, &splats).is_ok() {
             let reread = read(&path).unwrap_or_else(|error: Error| panic!("{error:?}"));

@@ -1,5 +1,5 @@
-//! Fuzz target for requests of the web page: accepted requests can be rendered. The crates `viz` and `trainer` are not
-//! linked, to keep the build fast.
+//! Fuzz target for requests of the web page: every accepted request must be safe to render. The crates `viz` and
+//! `trainer` are not linked, to keep the build fast.
 #![no_main]
 #![allow(dead_code, reason = "only client messages are tested here")]
 

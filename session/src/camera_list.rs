@@ -1,5 +1,5 @@
-//! The list of camera poses of a run, `cameras.json` next to the model. Viewers draw the cameras and choose their first
-//! view from them.
+//! The camera poses of a run, stored in `cameras.json` next to the model. Viewers draw these cameras and derive the
+//! initial view from them.
 
 use crate::error::Context;
 use crate::{camera_path, run_folder};
@@ -39,7 +39,7 @@ struct File {
     cameras: Vec<PosedCamera>,
 }
 
-/// The cameras of these keyframes with the model's corrections.
+/// The cameras of keyframes with the model's corrections applied.
 pub(crate) fn of_model(method: &mut dyn Method, keyframes: &[Arc<Keyframe>]) -> Vec<PosedCamera> {
     let mut cameras = Vec::new();
     for keyframe in keyframes {

@@ -53,7 +53,8 @@ impl CameraPath {
         Self::parse(&text).with_context(|| format!("the nerfstudio camera path {}", path.display()))
     }
 
-    /// A path with one viewpoint: 16 numbers, row major, `world_from_camera` with the axes of [`kinematics::camera`].
+    /// A path with one viewpoint, from the 16 numbers of `world_from_camera`, row major, with the axes of
+    /// [`kinematics::camera`].
     pub fn of_pose(numbers: &[f64]) -> Result<Self, Error> {
         let world_from_camera = rigid(numbers).map_err(|error| Error::BadInput(format!("--pose: {error}")))?;
         Ok(Self { cameras: vec![PathCamera { world_from_camera, fov_y_rad: None }], size_px: None })
@@ -82,19 +83,19 @@ impl CameraPath {
     }
 }
 
-/// The rigid transform of a 4x4 matrix, row major.
+/// Converts a row-major 4x4 matrix to a rigid transform.
 pub fn rigid(numbers: &[f64]) -> crate::Result<Transform> {
-    /// Files round to about six digits.
+    /// Numbers in files are often rounded to about six digits.
     const TOLERANCE: f64 = 1e-3;
     ensure!(numbers.len() == 16, "a pose has 16 numbers, got {}", numbers.len());
     ensure!(numbers.iter().all(|number| number.is_finite()), "the pose has a non-finite number");
     let matrix = Matrix4::from_row_slice(numbers);
     let rotation: Matrix3<f64> = matrix.fixed_view::<3, 3>(0, 0).into();
     let deviation = (rotation * rotation.transpose() - Matrix3::identity()).amax();
-    ensure!(deviation < TOLERANCE && rotation.determinant() > 0.0, "its upper left 3x3 block is not a rotation");
+    ensure!(deviation < TOLERANCE && rotation.determinant() > 0.0, "the upper left 3x3 block is not a rotation");
     ensure!(
         (matrix.row(3) - nalgebra::RowVector4::new(0.0, 0.0, 0.0, 1.0)).amax() < TOLERANCE,
-        "its last row is not 0 0 0 1"
+        "the last row is not 0 0 0 1"
     );
     let rotation = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix(&rotation));
     Ok(Transform::from_parts(Translation3::new(matrix[(0, 3)], matrix[(1, 3)], matrix[(2, 3)]), rotation))

@@ -23,7 +23,7 @@ const CHECKPOINT_SECS: &str = "checkpoint-secs";
 /// How often checkpoints are written.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct CheckpointOptions {
-    /// Time between two checkpoints; zero: never; `None`: 60 s.
+    /// Time between two checkpoints: 60 s if `None`; no checkpoints if zero.
     pub period: Option<Duration>,
 }
 
@@ -33,7 +33,7 @@ impl CheckpointOptions {
         Some((CHECKPOINT_SECS.to_owned(), self.period?.as_secs_f64().to_string()))
     }
 
-    /// This flag, or the value of the earlier run if it was not given.
+    /// These options, with the period of the earlier run if the flag was not given.
     pub fn or_previous(self, flags: &BTreeMap<String, String>) -> Self {
         let previous = || flags.get(CHECKPOINT_SECS).and_then(|text| parse_period(text).ok());
         Self { period: self.period.or_else(previous) }
@@ -44,7 +44,7 @@ impl CheckpointOptions {
 ///
 /// # Errors
 ///
-/// If it is no such number.
+/// If the text is not such a number.
 pub fn parse_period(text: &str) -> Result<Duration, String> {
     let secs = text.parse().ok().and_then(|secs| Duration::try_from_secs_f64(secs).ok());
     secs.ok_or_else(|| "expected a number of at least 0".to_owned())
@@ -61,23 +61,23 @@ pub fn read(folder: &Path) -> crate::Result<Checkpoint> {
 pub fn check_limit_not_passed(seconds: Option<f64>, checkpoint: &Checkpoint, subject: &str) -> Result<(), Error> {
     match seconds.filter(|seconds| *seconds <= checkpoint.seconds) {
         Some(seconds) => Err(Error::BadInput(format!(
-            "--seconds {seconds}: {subject} has already been trained for {:.1} s, which count; give a larger limit",
+            "--seconds {seconds}: {subject} has already been trained for {:.1} s, which counts; give a larger limit",
             checkpoint.seconds
         ))),
         None => Ok(()),
     }
 }
 
-/// What every checkpoint of a run contains in addition to the model state.
+/// Contents of every checkpoint of a run besides the model state.
 #[derive(Clone, Debug, Default)]
 pub struct RunFlags {
     /// SHA-256 of the model from which depth was rendered.
     pub depth_from: Option<String>,
-    /// Flags of the run that affect its keyframes, and its limits.
+    /// Flags of the run that affect its keyframes or limits, by name.
     pub flags: BTreeMap<String, String>,
 }
 
-/// The checkpoints of one run. Each one replaces the previous one.
+/// The checkpoints of one run. Each checkpoint replaces the previous one.
 pub struct Checkpoints {
     path: PathBuf,
     run_flags: RunFlags,
@@ -85,7 +85,7 @@ pub struct Checkpoints {
     /// Time after `last` at which the next checkpoint is due.
     due_after: Duration,
     last: Instant,
-    /// Keyframes that exist nowhere else on disk.
+    /// Storage of keyframes that exist nowhere else on disk; `None` if there is another copy.
     stored_keyframes: Option<StoredKeyframes>,
     last_keyframes: Instant,
     writer: Option<WriterThread>,
@@ -96,7 +96,7 @@ pub struct Checkpoints {
 /// A writer thread.
 struct WriterThread {
     thread: JoinHandle<crate::Result<()>>,
-    /// Whether it writes a checkpoint rather than only keyframes.
+    /// `true` if it writes a checkpoint, `false` if it writes only keyframes.
     is_checkpoint: bool,
 }
 
@@ -113,7 +113,7 @@ pub struct Snapshot<'a> {
 }
 
 impl Checkpoints {
-    /// Returns `None` if checkpoints are disabled. The first one is due after one period.
+    /// Returns `None` if checkpoints are disabled. The first checkpoint is due after one period.
     pub fn new(folder: &Path, options: CheckpointOptions) -> Option<Self> {
         let (period, path) = (options.period.unwrap_or(DEFAULT_PERIOD), folder.join(CHECKPOINT));
         (!period.is_zero()).then(|| Self {
@@ -141,13 +141,13 @@ impl Checkpoints {
         Self { stored_keyframes: Some(StoredKeyframes::of_run(run)), due_after, ..self }
     }
 
-    /// Whether keyframes are stored too.
+    /// Whether keyframes are also stored.
     pub fn keeps_keyframes(&self) -> bool {
         self.stored_keyframes.is_some()
     }
 
-    /// Starts a checkpoint if one is due and the previous one is complete; returns whether it did. Write errors are
-    /// logged and do not stop training.
+    /// Starts a checkpoint if one is due and the previous one is complete. Returns whether a checkpoint was started.
+    /// Write errors are logged and do not stop training.
     pub fn write_when_due(&mut self, now: Snapshot<'_>) -> Result<bool, trainer::Error> {
         if self.writer.as_ref().is_some_and(|writer| !writer.thread.is_finished()) {
             return Ok(false);
@@ -168,14 +168,14 @@ impl Checkpoints {
         Ok(false)
     }
 
-    /// Starts a checkpoint of the current state once the one in progress is complete.
+    /// Waits for the checkpoint in progress, then starts a checkpoint of the current state.
     pub fn begin(&mut self, now: Snapshot<'_>) -> Result<(), trainer::Error> {
         let job = self.take(now)?;
         self.write(job);
         Ok(())
     }
 
-    /// Copies the current state for writing later.
+    /// Copies the current state for [`Self::write`].
     pub fn take(&mut self, now: Snapshot<'_>) -> Result<CheckpointWrite, trainer::Error> {
         self.wait_and_warn();
         let started = Instant::now();
@@ -207,12 +207,13 @@ impl Checkpoints {
                 let previous = if self.path.exists() { "; the previous one is kept" } else { "" };
                 log::warn!("cannot write a checkpoint{previous}: {error:#}");
             }
-            // The next checkpoint stores them too, and warns if that fails.
+            // The next checkpoint tries to store the same keyframes, and a failure is then logged as a warning.
             Err(error) => log::debug!("cannot store keyframes: {error:#}"),
         }
     }
 
-    /// Path of the newest checkpoint of this run. If the one in progress fails, the previous one is used.
+    /// Path of the newest checkpoint of this run. Waits for the checkpoint in progress; if it fails, the previous
+    /// checkpoint is the newest.
     pub fn newest(&mut self) -> Option<&Path> {
         if let Err(error) = self.wait() {
             log::warn!("the checkpoint in progress failed: {error:#}");

@@ -1,10 +1,10 @@
-//! Training time in seconds.
+//! The clock of training time.
 
 use std::cell::Cell;
 use std::rc::Rc;
 use std::time::{Duration, Instant};
 
-/// Training time in seconds, excluding evaluation. Clones share the same time.
+/// Measures training time, excluding evaluation. Clones share the same time.
 #[derive(Clone, Debug, Default)]
 pub struct Clock(Rc<Cell<ClockState>>);
 
@@ -12,7 +12,7 @@ pub struct Clock(Rc<Cell<ClockState>>);
 struct ClockState {
     started: Option<Instant>,
     excluded: Duration,
-    /// Training time of earlier runs that this one continues.
+    /// Training time of the earlier runs that this run continues.
     previous_secs: f64,
 }
 
@@ -28,7 +28,7 @@ impl Clock {
         self.0.set(ClockState { started: state.started.or(Some(at)), ..state });
     }
 
-    /// Time at which the clock was started, if it was.
+    /// Time at which the clock was started; `None` if it is not running.
     pub fn started(&self) -> Option<Instant> {
         self.0.get().started
     }
@@ -39,7 +39,7 @@ impl Clock {
         self.0.set(ClockState { excluded: state.excluded + spent, ..state });
     }
 
-    /// Seconds so far.
+    /// Training time so far, seconds.
     pub fn secs(&self) -> f64 {
         let state = self.0.get();
         let of_this_run = |started: Instant| started.elapsed().saturating_sub(state.excluded).as_secs_f64();

@@ -1,4 +1,4 @@
-//! Writes the rig file with the calibration corrections that alignment found.
+//! Writes a rig file with the calibration corrections that alignment estimated.
 
 use crate::Error;
 use crate::error::Context;
@@ -31,7 +31,7 @@ pub fn corrected(rig: &Rig, alignment: &Alignment) -> crate::Result<Rig> {
     Ok(rig)
 }
 
-/// Checks that the rig file can be written there.
+/// Checks that a rig file can be written to this path.
 pub fn check_target_file(rig: &Rig, file: &Path) -> Result<(), Error> {
     let folder = file.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
     if !folder.is_dir() || file.is_dir() {
@@ -112,7 +112,7 @@ mod tests {
     use calibration::ScalarEstimate;
     use std::collections::BTreeMap;
 
-    const TOLERANCE: f64 = 1e-12; // Rounding of products of poses near 1.
+    const TOLERANCE: f64 = 1e-12; // Rounding errors of products of poses with elements near 1.
 
     fn bundled_rig() -> Rig {
         let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("../rigs/static-arm.toml");

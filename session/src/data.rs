@@ -17,16 +17,16 @@ use std::time::{Duration, Instant};
 use trainer::ModelKind;
 use trainer::gpu::Gpu;
 
-/// Which images are used, and for what.
+/// Which images are read, and how they are scaled and split.
 #[derive(Clone, Debug, Default)]
 pub struct DataOptions {
-    /// Use every n-th image for testing, or the images listed in this file; every 8th if `None`.
+    /// Test images: a number n for every n-th image, or a file that lists them. Every 8th image if `None`.
     pub holdout: Option<String>,
-    /// Use exactly the keyframes of this list.
+    /// List of the keyframes to use.
     pub keyframes: Option<PathBuf>,
-    /// Read a recording with this rig file instead of the one stored in it.
+    /// Rig file that replaces the rig file stored in a recording.
     pub rig: Option<PathBuf>,
-    /// Scale the images (not their depth) to this fraction of their width and height.
+    /// Fraction of the width and height to which color images are scaled. Depth images are not scaled.
     pub scale: Option<f64>,
 }
 
@@ -36,7 +36,7 @@ impl DataOptions {
         Ok(self.holdout.as_deref().map(Holdout::from_argument).transpose()?)
     }
 
-    /// The given flags that affect keyframes: names and values, with absolute paths for files.
+    /// Names and values of the given flags that affect keyframes. Paths of files are absolute.
     pub fn flags(&self) -> BTreeMap<String, String> {
         let canonical = |file: &Path| file.canonicalize().unwrap_or_else(|_| file.to_owned()).display().to_string();
         let holdout = |text: &String| if is_number(text) { text.clone() } else { canonical(Path::new(text)) };
@@ -56,10 +56,10 @@ impl DataOptions {
         rig.into_iter().chain(scale).flatten().collect()
     }
 
-    /// Completes these flags with those of an earlier run, `before`. A different number is an error. A different file
-    /// is accepted, because it may have moved; its contents are compared later.
+    /// Fills in missing flags from those of an earlier run, `before`. A number must be the same as before. A path may
+    /// differ, because the file may have moved; its contents are compared later.
     ///
-    /// `subject`: name of the earlier result for messages.
+    /// `subject`: name of the earlier result in messages.
     pub fn completed_with(&self, subject: &str, before: &BTreeMap<String, String>) -> Result<Self, Error> {
         let now = self.flags();
         for (name, value) in before {
@@ -69,10 +69,10 @@ impl DataOptions {
             }
         }
         let unset_flag = |name: &str| before.get(name).filter(|_| !now.contains_key(name));
-        // Both flags select images, so either one replaces both.
+        // `--holdout` and `--keyframes` both select images, so giving either one discards both earlier values.
         let image_flag = |name: &str| unset_flag(name).filter(|_| self.holdout.is_none() && self.keyframes.is_none());
         let scale = unset_flag("scale").map(|scale| scale.parse());
-        let scale = scale.transpose().map_err(|_| Error::BadInput(format!("{subject}: its scale is not a number")))?;
+        let scale = scale.transpose().map_err(|_| Error::BadInput(format!("{subject}: the scale is not a number")))?;
         let restored = Self {
             holdout: self.holdout.clone().or(image_flag("holdout").cloned()),
             keyframes: self.keyframes.clone().or(image_flag("keyframes").map(PathBuf::from)),
@@ -86,7 +86,7 @@ impl DataOptions {
             .map(|(name, value)| format!("--{name} {value}"))
             .collect();
         if !restored_flags.is_empty() {
-            log::info!("using {}, as {subject} was trained with", restored_flags.join(" "));
+            log::info!("using the flags that {subject} was trained with: {}", restored_flags.join(" "));
         }
         Ok(restored)
     }
@@ -98,7 +98,7 @@ fn is_number(text: &str) -> bool {
 
 /// Loaded keyframes and their metadata.
 pub struct Data {
-    /// In the order of the data.
+    /// The keyframes, in the order of the data.
     pub keyframes: Vec<Arc<Keyframe>>,
     /// Names of the images, in the same order.
     pub names: Vec<String>,
@@ -106,7 +106,7 @@ pub struct Data {
     pub rig: Option<Rig>,
     /// Whether the stamps are times rather than image indices.
     pub has_times: bool,
-    /// Data that could not be read. If there are any, the exit code is 3.
+    /// Descriptions of data that could not be read. The exit code is 3 unless this is empty.
     pub data_losses: Vec<String>,
     /// The correction of the base pose at each station after the first.
     pub stations: Vec<StationReport>,
@@ -116,7 +116,7 @@ pub struct Data {
     pub preparation_time: Duration,
 }
 
-/// What the data are used for.
+/// Purpose of the data.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Purpose {
     /// Needs at least one training image.
@@ -125,19 +125,19 @@ pub enum Purpose {
     Scoring,
 }
 
-/// Which images are used.
+/// The resolved selection of images.
 struct DataSelection {
     list: Option<KeyframeList>,
     holdout: Option<Holdout>,
     scale: Option<f64>,
     /// Replaces the rig stored in a recording.
     rig: Option<PathBuf>,
-    /// Uses base poses as reported, without corrections at stations.
+    /// Whether base poses are used as reported, without corrections at stations.
     use_reported_poses: bool,
 }
 
 impl Data {
-    /// Reads a folder, or a recording through the join.
+    /// Reads a dataset folder, or a recording whose images are joined with poses.
     pub fn load(
         path: &Path,
         args: &DataOptions,
@@ -156,7 +156,7 @@ impl Data {
         )
     }
 
-    /// Reads the keyframes of a list, with images scaled to this fraction of their size and base poses as reported.
+    /// Reads the keyframes of a list. Images are scaled by `scale`, and base poses are used as reported.
     pub fn of_list(
         path: &Path,
         list: KeyframeList,
@@ -207,13 +207,13 @@ impl Data {
         Ok(data)
     }
 
-    /// The rig with which a recording is read, before flags override it.
+    /// The rig of a recording, before flags override its keys.
     pub fn rig_as_given(path: &Path, args: &DataOptions) -> crate::Result<Rig> {
         let rig = args.rig.as_deref().map(|file| Rig::load(file, &[])).transpose()?;
         Ok(open::recording(path, rig, &[])?.rig)
     }
 
-    /// The methods to train if no flag names any: those in the rig file of a recording, read before everything else.
+    /// The methods to train if no flag names any: those in the rig file of a recording, or else the default method.
     pub fn default_methods(path: &Path, args: &DataOptions) -> crate::Result<Vec<ModelKind>> {
         expect(path)?;
         if is_recording(path) { methods_of(&Self::rig_as_given(path, args)?) } else { Ok(vec![ModelKind::default()]) }
@@ -331,7 +331,7 @@ impl Data {
         (self.stations, self.preparation_time) = (stations.reports().to_vec(), stations.spent());
     }
 
-    /// Assigns splits anew, separately for each camera.
+    /// Reassigns the splits, separately for each camera.
     fn assign_splits(&mut self, holdout: &Holdout) -> crate::Result<()> {
         let mut by_camera: BTreeMap<Arc<str>, Vec<usize>> = BTreeMap::new();
         for (ix, keyframe) in self.keyframes.iter().enumerate() {

@@ -1,4 +1,4 @@
-//! Exports keyframes as a nerfstudio folder: color PNG, 16-bit depth, poses, split lists.
+//! Exports keyframes as a nerfstudio dataset: color PNG, 16-bit depth, poses, split lists.
 
 use crate::error::Context;
 use crate::partial::Partial;
@@ -11,12 +11,12 @@ use serde_json::{Map, Value, json};
 use std::path::Path;
 use std::sync::Arc;
 
-/// Depth unit that readers assume if the file does not specify one: millimeters.
+/// Depth unit: millimeters, which readers assume if the file does not specify a unit.
 const METERS_PER_COUNT: f64 = 0.001;
-/// Maximum difference between the lenses of depth and photo, in pixels of the depth image. Above it, depth cannot be
-/// stored with the photo.
+/// Maximum difference between the intrinsics of depth and color, in pixels of the depth image. If they differ more,
+/// depth is not exported.
 const MAX_LENS_DIFFERENCE_PX: f64 = 0.5;
-/// The test photos, one per line, in the format of `--holdout`.
+/// List of the test images, one per line, in the format of `--holdout`.
 const TEST_LIST: &str = "test.txt";
 /// The split lists of nerfstudio.
 const LISTS: [(&str, Split); 3] =
@@ -28,20 +28,20 @@ const IMAGES: &str = "images";
 const MASKS: &str = "masks";
 const DEPTH: &str = "depth";
 
-/// Counts of what was written.
+/// Numbers of exported images.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Written {
     /// Number of images.
     pub n_images: usize,
     /// Number of depth images.
     pub n_depth: usize,
-    /// Depth images that were left out because their intrinsics differ from those of the photo, which the format cannot
-    /// express.
+    /// Number of depth images that were left out, because their intrinsics differ from those of the color image. The
+    /// format cannot express this.
     pub n_depth_skipped: usize,
 }
 
-/// Writes a folder, which must not contain a dataset yet. `transforms.json` is written last, so a folder that has it is
-/// complete.
+/// Writes a dataset to a folder that does not contain one yet. `transforms.json` is written last, so a folder that has
+/// it is complete.
 ///
 /// Depth is rounded to millimeters and limited to 65 m. Velocities, readout times and ground truth of simulators are
 /// not exported.
@@ -126,12 +126,12 @@ fn camera_keys(keyframe: &Keyframe) -> Map<String, Value> {
 
 /// The pose as four rows, for a camera that looks along -z with y up.
 fn opengl_rows(world_from_camera: &Transform) -> Value {
-    // A rotation by half a turn is its own inverse.
+    // `opengl_from_camera` is half a turn, so it equals its inverse `camera_from_opengl`.
     let rows = transform::to_rows(&(world_from_camera * nerfstudio::opengl_from_camera()));
     json!(rows.as_chunks::<4>().0)
 }
 
-/// Whether the depth image has the photo's lens, scaled to its size.
+/// Whether depth and color have the same intrinsics, apart from the size of their images.
 fn has_lens_of(depth: &DepthMap, keyframe: &Keyframe) -> bool {
     (0..2).all(|axis| {
         let ratio = f64::from(depth.size_px[axis]) / f64::from(keyframe.size_px[axis]);
@@ -254,7 +254,7 @@ mod tests {
     }
 
     #[test]
-    fn existing_dataset_is_not_overwritten_and_empty_is_an_error() {
+    fn empty_exports_and_existing_datasets_are_rejected() {
         let folder = tempfile::tempdir().unwrap();
         assert!(write_nerfstudio(folder.path(), std::iter::empty()).unwrap_err().to_string().contains("no keyframe"));
         write_nerfstudio(folder.path(), std::iter::once(Arc::new(keyframe(0)))).unwrap();

@@ -1,7 +1,7 @@
 //! The log of timing-dependent decisions: at which step each keyframe was added or removed, and when training ended.
 //!
-//! One JSON object per line, see `docs/reference/files.md`. The log contains no times: replaying it with the same data
-//! gives the same model.
+//! One JSON object per line, see `docs/reference/files.md`. The log contains steps but no times, so that replaying it
+//! with the same data gives the same model.
 
 use crate::Error;
 use crate::error::Context;
@@ -20,7 +20,7 @@ use trainer::ModelOptions;
 const VERSION: u64 = 3;
 /// Name of the log in the run folder.
 const FILE: &str = "decisions.jsonl";
-/// Maximum number of decisions that wait for the disk. When the queue is full, training waits.
+/// Maximum number of decisions that wait to be written. Training waits while this queue is full.
 const MAX_WAITING: usize = 4096;
 
 /// The first line: the settings.
@@ -32,20 +32,20 @@ pub struct Settings {
     pub method: String,
     /// Name of the dataset folder or recording; `None` if a live run was not recorded.
     pub data: Option<String>,
-    /// The GPU adapter: others round differently.
+    /// The GPU adapter. Other adapters round differently.
     pub adapter: String,
     /// Fraction of the width and height to which images were scaled.
     pub scale: f64,
     /// SHA-256 of the model from which missing depth was rendered; `None` if depth was not rendered.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub depth_from: Option<String>,
-    /// Number of earlier updates if the run continued from a checkpoint.
+    /// Step of the checkpoint that training continued from; `None` for a new run.
     pub from_step: Option<u64>,
     /// Options of the model.
     pub options: ModelOptions,
 }
 
-/// Everything that determines a training result besides its data.
+/// All inputs of a training run besides its data.
 pub struct RunDescription<'a> {
     /// Name of the method.
     pub method: &'a str,
@@ -53,11 +53,11 @@ pub struct RunDescription<'a> {
     pub data: Option<&'a Path>,
     /// Description of the GPU.
     pub adapter: String,
-    /// Size of the images relative to those of the data.
+    /// Fraction of the width and height to which images are scaled.
     pub scale: f64,
     /// SHA-256 of the model from which depth was rendered.
     pub depth_from: Option<String>,
-    /// Step of the checkpoint that training continues from.
+    /// Step of the checkpoint that training continues from; `None` for a new run.
     pub from_step: Option<u64>,
     /// Options of the model.
     pub options: ModelOptions,
@@ -81,7 +81,7 @@ impl Settings {
 }
 
 impl Settings {
-    /// The settings of a run that continues from a checkpoint after this many updates, or restarts.
+    /// The same settings for a run that continues from the checkpoint of step `from_step`, or restarts if `None`.
     pub fn continued_from(&self, from_step: Option<u64>) -> Self {
         Self { from_step, ..self.clone() }
     }
@@ -106,9 +106,9 @@ pub enum Decision {
     Push(Pushed),
     /// A keyframe was removed.
     Remove(Removed),
-    /// A viewer requested a picture, so splats were created from the keyframes so far before the next one was added.
+    /// A picture was drawn before the next keyframe was added. This created splats from the keyframes so far.
     Seed(True),
-    /// Training on the keyframes so far was started before the next one was added, but no update was made yet.
+    /// Training on the keyframes so far was started, but no update was made before the next keyframe was added.
     Begin(True),
     /// A checkpoint was taken at this step.
     Checkpoint(True),
@@ -167,7 +167,7 @@ impl Pushed {
         }
     }
 
-    /// The keyframe as it was added, computed from the keyframe with base poses as reported.
+    /// The keyframe as it was added: `reported` with the logged correction of its base pose applied.
     pub fn corrected(&self, reported: &Arc<Keyframe>) -> Arc<Keyframe> {
         match self.map_from_odom {
             Some(numbers) => Arc::new(reported.with_base_correction(&motion(numbers))),
@@ -205,7 +205,7 @@ fn fingerprint_of(keyframe: &Keyframe) -> String {
     format!("{:016x}", keyframe::fingerprint(keyframe))
 }
 
-/// Activity since the last logged decision that affects the next one.
+/// Activity since the last logged decision, if it affects the result.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Activity {
     Nothing,
@@ -250,7 +250,7 @@ impl DecisionLog {
         Ok(log)
     }
 
-    /// Logs a keyframe that a checkpoint already contains.
+    /// Logs a keyframe that the model in a checkpoint was trained on.
     pub fn restored(&mut self, step: u64, keyframe: &Arc<Keyframe>) {
         self.write(Line::Restored(step, keyframe.clone()));
     }
@@ -268,7 +268,7 @@ impl DecisionLog {
         self.write(Line::Entry(Entry { step, decision: Decision::Remove(removed_keyframe) }));
     }
 
-    /// Records that a viewer requested a picture.
+    /// Records that a picture was drawn.
     pub fn seeded(&mut self) {
         if self.activity == Activity::Nothing {
             self.activity = Activity::Seeded;
@@ -303,10 +303,10 @@ impl DecisionLog {
     /// returns.
     pub fn close_unfinished(self) {
         drop(self.sender);
-        let _ = self.thread.join(); // An incomplete log counts as truncated at an earlier step.
+        let _ = self.thread.join(); // After a write error, the log is valid up to an earlier step.
     }
 
-    /// Logs activity between two decisions if no update in between implies it.
+    /// Logs the activity since the last decision, unless a larger step number already implies it.
     fn log_activity(&mut self, step: u64) {
         let pending = match std::mem::replace(&mut self.activity, Activity::Nothing) {
             Activity::Seeded => Some(Decision::Seed(True)),
@@ -322,7 +322,7 @@ impl DecisionLog {
     }
 
     fn write(&mut self, line: Line) {
-        // If the thread has ended, joining it returns its error.
+        // Sending fails only if the thread has ended, and joining the thread returns its error.
         let _ = self.sender.send(line);
     }
 }
@@ -378,7 +378,7 @@ impl Decisions {
             serde_json::from_str(first).map_err(|e| invalid(format!("line 1: {e}")))?;
         match description["version"].as_u64() {
             Some(VERSION) => {}
-            Some(other) => return Err(invalid(format!("it has version {other}, expected {VERSION}"))),
+            Some(other) => return Err(invalid(format!("unsupported version {other}, expected {VERSION}"))),
             None => return Err(invalid("line 1 has no version".to_owned())),
         }
         let settings = serde_json::from_value(description).map_err(|e| invalid(format!("line 1: {e}")))?;
@@ -393,7 +393,7 @@ impl Decisions {
                 return Err(invalid(format!("line {number} comes after the end")));
             }
             if before.is_some_and(|before| before.step > entry.step) {
-                return Err(invalid(format!("line {number}: step {} comes after a later one", entry.step)));
+                return Err(invalid(format!("line {number}: step {} comes after a later step", entry.step)));
             }
             if let Decision::Restored(pushed) | Decision::Push(pushed) = &entry.decision
                 && pushed.split().is_none()
@@ -451,7 +451,7 @@ mod tests {
     /// A log with two keyframes, a picture request between them, a removal, and the end.
     fn written(folder: &Path) -> String {
         let mut log = DecisionLog::create(folder, settings(None)).expect("a log");
-        log.seeded(); // Before there is any keyframe.
+        log.seeded(); // Not logged, because there is no keyframe yet.
         log.pushed(0, &keyframe(17, Split::Test));
         log.seeded();
         log.pushed(0, &keyframe(18, Split::Train));
@@ -543,7 +543,7 @@ mod tests {
             ("\"begin\":true", "\"begin\":false", "line 5: must be true"),
             ("\"seed\":true", "\"sing\":true", "line 3: "),
             ("\"validation\"", "\"selected\"", "line 6: \"selected\" is not train"),
-            ("{\"step\":40,\"remove\"", "{\"step\":70,\"remove\"", "line 8: step 40 comes after a later one"),
+            ("{\"step\":40,\"remove\"", "{\"step\":70,\"remove\"", "line 8: step 40 comes after a later step"),
             ("{\"step\":40,\"checkpoint\":true}", "{\"step\":40,\"end\":true}", "line 9 comes after the end"),
         ] {
             assert!(text.contains(was), "{was}");

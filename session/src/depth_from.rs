@@ -25,10 +25,10 @@ pub struct DepthSource {
 pub struct RenderedDepth {
     model: PathBuf,
     model_sha256: String,
-    /// Number of images for which depth was rendered; only images with depth on less than half of their pixels are
+    /// Number of images for which depth was rendered. Only images that lack depth in more than half of their pixels are
     /// eligible.
     pub n_images: usize,
-    /// Fraction of the missing pixels of such images that were filled.
+    /// Fraction of the missing depth pixels of eligible images that were filled.
     rendered_frac: f64,
 }
 
@@ -46,7 +46,7 @@ impl DepthSource {
         Ok(Self { model: model.to_owned(), sha256 })
     }
 
-    /// Renders depth for all keyframes except test keyframes that have no depth or only sparse depth. Measured depth is
+    /// Renders depth for training and validation keyframes that have no depth or only sparse depth. Measured depth is
     /// kept.
     pub fn draw(
         &self,
@@ -90,9 +90,9 @@ impl DepthSource {
     }
 }
 
-/// Returns an error unless both SHA-256 sums, of the model used `before` and of the one given `now`, are the same.
+/// Returns an error unless the depth models used `before` and given `now` have the same SHA-256.
 ///
-/// `subject`: name of the earlier result for messages.
+/// `subject`: name of the earlier result in messages.
 pub fn check_same(subject: &str, before: Option<&str>, now: Option<&str>) -> Result<(), Error> {
     match (before, now) {
         (before, now) if before == now => Ok(()),
@@ -114,8 +114,8 @@ struct Filled {
     n_rendered: u64,
 }
 
-/// Renders the missing depth of one keyframe: in the pixels of its depth image, or of its color image if it has no
-/// depth image.
+/// Renders the missing depth of one keyframe at the resolution of its depth image, or of its color image if it has no
+/// depth.
 fn fill(model: &mut dyn Method, keyframe: &mut Arc<Keyframe>) -> crate::Result<Filled> {
     let mut request_keyframe = keyframe.as_ref().clone();
     let depth = request_keyframe.depth.get_or_insert_with(|| DepthMap {
@@ -137,7 +137,7 @@ fn fill(model: &mut dyn Method, keyframe: &mut Arc<Keyframe>) -> crate::Result<F
     Ok(filled)
 }
 
-/// Measured depth in meters, filled with rendered depth where it is missing; 0 where neither is known.
+/// Measured depth in meters. Missing pixels are filled with rendered depth, or 0 if that is missing, too.
 fn merge_depth(own_m: &[f32], rendered: &Picture) -> (Vec<f32>, Filled) {
     let is_known = |z: f32| z > 0.0 && z.is_finite();
     let mut filled = Filled::default();

@@ -7,16 +7,16 @@ use std::fmt::{Display, Formatter};
 /// The result of a fallible operation of this crate.
 pub type Result<T, E = Error> = std::result::Result<T, E>;
 
-/// Why a session cannot train, evaluate, save or resume.
+/// Reason why a session cannot train, evaluate, save or resume.
 ///
-/// [`Error::class`] distinguishes invalid input, insufficient data and failures. The message of the error is its outermost
-/// context; `{:#}` gives the message with all causes.
+/// [`Error::class`] distinguishes invalid input, insufficient data and failures. `{}` prints the outermost context;
+/// `{:#}` also prints all causes.
 #[derive(Debug)]
 #[non_exhaustive]
 pub enum Error {
     /// The arguments, or a file they name, are invalid.
     BadInput(String),
-    /// The input is not sufficient for a result.
+    /// There is not enough data for a result.
     InsufficientData(String),
     /// Something failed.
     Failed(String),
@@ -34,11 +34,11 @@ pub enum Error {
     Io(std::io::Error),
     /// An error of another library.
     Other(Box<dyn StdError + Send + Sync>),
-    /// The GPU failed and the run could not continue on another device. The message names what is saved on disk.
+    /// The GPU failed and the run could not continue on another device. The message describes how to continue.
     GpuUnrecoverable(String),
     /// The operation that failed, with the cause.
     Context {
-        /// What was being done, or the file, device or image concerned.
+        /// The operation, or the file, device or image on which it failed.
         context: String,
         /// Why it failed.
         source: Box<Self>,
@@ -46,7 +46,7 @@ pub enum Error {
 }
 
 impl Error {
-    /// What the error means for the caller.
+    /// Whether the input is invalid, the data are insufficient, or the operation failed.
     #[must_use]
     pub fn class(&self) -> ErrorClass {
         match self {
@@ -65,7 +65,7 @@ impl Error {
         }
     }
 
-    /// The error without the operations that failed.
+    /// The error without its contexts.
     fn root(&self) -> &Self {
         match self {
             Self::Context { source, .. } => source.root(),
@@ -110,7 +110,7 @@ impl Error {
     }
 }
 
-/// Writes the message; in the alternate form `{:#}`, followed by those of all causes.
+/// Writes the message. The alternate form `{:#}` appends the messages of all causes.
 impl Display for Error {
     fn fmt(&self, f: &mut Formatter<'_>) -> std::fmt::Result {
         match self {

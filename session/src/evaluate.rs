@@ -1,6 +1,6 @@
-//! Evaluates a model: renders every test keyframe from its pose at its size, and scores the result.
+//! Evaluates a model: renders it at the pose and size of each test keyframe, and scores the renders.
 //!
-//! The only evaluation in the program: `train`, `run` and `eval` report the same scores for the same model.
+//! `train`, `run` and `eval` all use this code, so they report the same scores for the same model.
 
 use crate::error::Context;
 use calibration::CalibratedCamera;
@@ -13,7 +13,7 @@ use std::sync::Arc;
 use trainer::eval::{Lpips, PixelPair, SurfaceError, depth_rmse_m, psnr, ssim, surface_error};
 use trainer::{Method, Picture, Projection, RenderRequest};
 
-/// Environment variable with the path of the LPIPS weights, used if no flag gives one.
+/// Environment variable with the path of the LPIPS weights, used if the flag is not given.
 const LPIPS_WEIGHTS: &str = "FIELDRIG_LPIPS_WEIGHTS";
 /// Near plane of renders, meters.
 const NEAR_M: f64 = 0.01;
@@ -22,10 +22,10 @@ const FAR_M: f64 = 1000.0;
 
 /// Minimum alpha of a pixel that counts as covered by the model.
 pub const MIN_ALPHA: u8 = 128;
-/// Minimum covered fraction; below it, the model probably does not show the scene of the images.
+/// Minimum covered fraction. With less, model and images probably show different scenes.
 pub const MIN_COVERED_FRAC: f64 = 0.05;
-/// Hint for that case.
-pub const CHECK_SAME_SCENE: &str = "do both show the same scene in the same world frame?";
+/// Hint to print if the covered fraction is below [`MIN_COVERED_FRAC`].
+pub const CHECK_SAME_SCENE: &str = "check that model and camera poses belong to the same scene and world frame";
 
 /// Loads LPIPS if the flag or `FIELDRIG_LPIPS_WEIGHTS` gives weights. A program built without LPIPS logs a warning.
 pub fn load_lpips(flag: Option<&Path>) -> Result<Option<Lpips>, trainer::Error> {
@@ -62,21 +62,21 @@ pub struct ImageScores {
     pub ssim: Option<f64>,
     /// Perceptual distance; `None` without weights.
     pub lpips: Option<f64>,
-    /// Root mean square error along z over pixels where both have depth, meters.
+    /// Root mean square error along z over pixels with rendered and measured depth, meters.
     pub depth_rmse_m: Option<f64>,
-    /// Accuracy: mean distance of the rendered surface from the measured one along its normal, meters.
+    /// Accuracy: mean distance of the rendered surface from the measured surface along the measured normal, meters.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub surface_error_m: Option<f64>,
     /// Completeness: fraction of the measured surface that is rendered within 5 mm.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub surface_within_5_mm: Option<f64>,
-    /// PSNR against the noise-free image, rendered at the true pose, dB; in simulation only.
+    /// PSNR of a render at the true pose against the noise-free image, dB; in simulation only.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub psnr_truth: Option<f64>,
-    /// PSNR of the delivered image against the noise-free one, dB; in simulation only.
+    /// PSNR of the delivered image against the noise-free image, dB; in simulation only.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub psnr_ceiling: Option<f64>,
-    /// Fraction of pixels that the model covers; `None` if the picture stayed on the GPU.
+    /// Fraction of pixels that the model covers; `None` if the render was scored on the GPU.
     #[serde(skip)]
     pub covered_frac: Option<f64>,
 }
@@ -104,7 +104,7 @@ pub struct Scores {
     /// See [`ImageScores::psnr_ceiling`].
     #[serde(skip_serializing_if = "Option::is_none")]
     pub psnr_ceiling: Option<f64>,
-    /// PSNR per camera; empty if there is only one.
+    /// PSNR per camera; empty if there is only one camera.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     pub psnr_per_camera: BTreeMap<String, f64>,
 }
@@ -224,7 +224,7 @@ pub fn covered_frac(picture: &Picture) -> f64 {
     n_covered as f64 / pixels.len().max(1) as f64
 }
 
-/// Warns if a model covers almost nothing of these pictures, given the covered fraction of each.
+/// Logs a warning if a model covers almost nothing of several pictures, given the covered fraction of each.
 pub fn warn_if_hardly_covered(covered_fracs: &[f64]) {
     let covered_frac = covered_fracs.iter().sum::<f64>() / covered_fracs.len().max(1) as f64;
     if covered_frac < MIN_COVERED_FRAC {
@@ -243,7 +243,7 @@ fn mean(values: impl Iterator<Item = Option<f64>>) -> Option<f64> {
     (n > 0.0).then(|| sum / n)
 }
 
-/// Renders a model from the pose of a keyframe, with the same rolling shutter and the camera's gains.
+/// Renders a model at the pose of a keyframe, with the keyframe's rolling shutter and color gains.
 pub fn draw(method: &mut dyn Method, keyframe: &Keyframe, depth: bool) -> Result<Picture, trainer::Error> {
     let lens = method.calibrated_camera(keyframe)?;
     let mut picture = method.render(&RenderRequest { depth, ..request(keyframe, &lens) })?;
@@ -258,15 +258,15 @@ pub fn draw(method: &mut dyn Method, keyframe: &Keyframe, depth: bool) -> Result
     Ok(picture)
 }
 
-/// PSNR of the picture that [`draw`] returns against the image of the keyframe, bit-identical, without reading the
-/// picture back. `None` if the method does not support it, or if gains are applied after rendering.
+/// Computes the PSNR of [`draw`]'s picture on the GPU, bit-identical to the PSNR of the picture on the host. `None` if
+/// the method does not support this, or if gains are applied after rendering.
 fn psnr_on_gpu(method: &mut dyn Method, keyframe: &Keyframe) -> Result<Option<f64>, trainer::Error> {
     let lens = method.calibrated_camera(keyframe)?;
     if lens.gains == [1.0; 3] { method.psnr(&request(keyframe, &lens), keyframe) } else { Ok(None) }
 }
 
-/// Renders a model from the pose of a keyframe's depth image, with the size and intrinsics of `depth`: the full depth
-/// map or a subsampled one. `None` for a keyframe without depth.
+/// Renders a model at the pose of a keyframe's depth image. Size and intrinsics come from `depth`, which may be a
+/// subsampled depth map. `None` for a keyframe without depth.
 pub fn render_depth(
     method: &mut dyn Method,
     keyframe: &Keyframe,
@@ -306,7 +306,7 @@ fn request(keyframe: &Keyframe, lens: &CalibratedCamera) -> RenderRequest {
     }
 }
 
-/// Error of rendered depth relative to measured depth.
+/// Errors of rendered depth, compared with measured depth.
 #[derive(Default)]
 struct DepthError {
     rmse_m: Option<f64>,
@@ -325,7 +325,7 @@ fn depth_error(method: &mut dyn Method, keyframe: &Keyframe) -> crate::Result<De
     })
 }
 
-/// PSNR against the noise-free image, which has no rolling shutter and was taken from the true pose.
+/// PSNR of a render at the true pose against the noise-free image, which has no rolling shutter.
 fn truth_score(method: &mut dyn Method, keyframe: &Keyframe) -> crate::Result<Option<f64>> {
     let Some(truth) = &keyframe.truth else { return Ok(None) };
     let lens = CalibratedCamera { world_from_camera: truth.world_from_camera, ..method.calibrated_camera(keyframe)? };

@@ -13,7 +13,7 @@ impl Default for EvaluationSchedule {
 }
 
 impl EvaluationSchedule {
-    /// Whether an evaluation time was reached at `secs`. Several reached at once count as one.
+    /// Whether an evaluation time was reached since the last call. Several times reached at once count as one.
     pub fn reached(&mut self, secs: f64) -> bool {
         let mut reached = false;
         while secs >= self.next_secs {
@@ -36,7 +36,7 @@ pub fn up_to(secs: f64) -> impl Iterator<Item = f64> {
         .take_while(move |evaluation_secs| *evaluation_secs <= secs)
 }
 
-/// Doubles the time; after 32 s continues with whole minutes, starting at 60 s.
+/// Twice the time, except that 60 s follows 32 s.
 fn next_after(evaluation_secs: f64) -> f64 {
     if evaluation_secs == 32.0 { 60.0 } else { 2.0 * evaluation_secs }
 }

@@ -1,4 +1,4 @@
-//! When each keyframe of a live run passed the stages from the camera to the model.
+//! Times at which each keyframe of a live run passed the stages from the camera to the model.
 
 use capture::InputTimes;
 use kinematics::Stamp;
@@ -14,11 +14,11 @@ pub struct KeyframeTimes {
     pub stamp: Stamp,
     /// Times in the input.
     pub input: InputTimes,
-    /// It was added to the model.
+    /// Time at which it was added to the model.
     pub pushed: Instant,
-    /// Steps of the model at that time, including queued ones.
+    /// Number of steps of the model at `pushed`, including queued steps.
     pub pushed_at_step: u64,
-    /// The first submit of steps after that was complete; `None` before.
+    /// Time at which the first steps after `pushed` were complete; `None` until then.
     pub trained: Option<Instant>,
 }
 
@@ -26,7 +26,7 @@ pub struct KeyframeTimes {
 #[derive(Debug, Default)]
 pub struct Ledger {
     keyframes: Vec<KeyframeTimes>,
-    /// Number of keyframes, from the first, for which [`KeyframeTimes::trained`] is known.
+    /// Number of keyframes, from the first, whose [`KeyframeTimes::trained`] is known.
     n_trained: usize,
 }
 
@@ -37,7 +37,7 @@ impl Ledger {
         &self.keyframes
     }
 
-    /// Number of keyframes, from the first, that a model has taken a step with after `step` steps.
+    /// Number of keyframes, from the first, that were available in at least one of the first `step` steps.
     #[must_use]
     pub fn n_in_model(&self, step: u64) -> usize {
         self.keyframes.partition_point(|keyframe| keyframe.pushed_at_step < step)
@@ -48,7 +48,7 @@ impl Ledger {
         self.keyframes.push(keyframe);
     }
 
-    /// Notes that the model has completed `step` steps.
+    /// Records that the model has completed `step` steps.
     pub(crate) fn completed(&mut self, step: u64) {
         let n_trained = self.n_in_model(step).max(self.n_trained);
         let now = Instant::now();

@@ -1,15 +1,15 @@
-//! Training sessions: one or several models that learn from keyframes, are evaluated on a schedule, and survive failures.
+//! Training sessions: train models on keyframes, evaluate them on a schedule, and recover from failures.
 //!
-//! A [`Session`] is one model in training with its clock, evaluations, checkpoints and reports. [`train`] and [`drive`]
-//! train on keyframes from disk, which [`Data`] reads; [`Live`] is the loop of a live run, which takes keyframes from a
-//! [`capture::Feed`] and draws pictures for viewers. [`finish`] saves and scores the models. Timing-dependent decisions
-//! are logged ([`DecisionLog`]) and can be repeated ([`Replay`]). Reports go to an [`Observer`].
+//! A [`Session`] is one model in training with its clock, evaluations, checkpoints and reports. [`Data`] reads
+//! keyframes from disk; [`train`] and [`drive`] train on them. [`Live`] is the loop of a live run: it takes keyframes
+//! from a [`capture::Feed`] and draws pictures for viewers. [`finish`] saves and scores the models. Timing-dependent
+//! decisions are logged ([`DecisionLog`]) and can be replayed ([`Replay`]). An [`Observer`] receives all reports.
 //!
 //! ```
 //! use keyframe::{Keyframe, Split};
 //! use session::{DataOptions, Limits, limits};
 //!
-//! // Train for ten seconds unless a limit is given.
+//! // Training stops after ten seconds unless another limit is given.
 //! assert_eq!(limits(None, None, 10.0)?.describe(), "10 s");
 //! assert_eq!(limits(None, Some(500), 10.0)?.describe(), "500 steps");
 //! assert!(limits(Some(-1.0), None, 10.0).is_err());

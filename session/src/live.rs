@@ -15,28 +15,28 @@ use viz::{Hub, KeyframePose, ModelStatus, Status};
 const PUBLISH_PERIOD: Duration = Duration::from_millis(250);
 /// Maximum wait for a keyframe when there is nothing to do.
 const IDLE: Duration = Duration::from_millis(10);
-/// Fraction of the time spent on scores between scheduled evaluations.
+/// Maximum fraction of the time that is spent on scoring between scheduled evaluations.
 const SCORE_FRAC: f64 = 0.03;
-/// How often to check for keyframes while waiting for a keyframe or a picture request.
+/// Polling period while waiting for a keyframe or a picture request.
 const POLL_PERIOD: Duration = Duration::from_millis(2);
-/// Pictures are drawn for at most this long before other work continues.
+/// Maximum time for which pictures are drawn before other work continues.
 const MAX_RENDER_TIME: Duration = Duration::from_millis(100);
 
-/// What determines when keyframes are taken.
+/// When the models receive keyframes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Pace {
-    /// Real time: keyframes are taken as they arrive.
+    /// In real time: as soon as a keyframe arrives.
     RealTime,
-    /// Lockstep with the trainer: a keyframe is taken every given number of steps, so that a seed gives one result.
+    /// In lockstep with training: one keyframe per fixed number of steps, so that a seed determines the result.
     Lockstep {
         /// Steps between two keyframes.
         steps_per_keyframe: u64,
     },
 }
 
-/// The parts of a live run.
+/// A live run.
 pub struct Live {
-    /// The first one is drawn for viewers that name no method.
+    /// The first model is drawn for requests that name no method.
     sessions: Vec<Session>,
     feed: Feed,
     hub: Hub,
@@ -53,12 +53,12 @@ pub struct Live {
     scoring_time: Duration,
     notes: Vec<String>,
     recoveries: Recoveries,
-    /// Of the first session.
+    /// Times of the keyframes of the first session.
     ledger: Ledger,
 }
 
 impl Live {
-    /// Combines the parts; does not start anything yet.
+    /// Combines the parts. Training starts with the first call of [`Self::advance`].
     pub fn new(sessions: Vec<Session>, feed: Feed, hub: Hub, options: LiveOptions) -> Self {
         Self {
             next_keyframe_at: vec![0; sessions.len()],
@@ -97,16 +97,16 @@ impl Live {
     /// without training data.
     pub fn is_over(&self) -> bool {
         if self.is_scoring() {
-            return false; // Scores at the limit are still reported.
+            return false; // An evaluation in progress is completed first.
         }
-        // If one session has reached its limit, the run waits for the others as long as they can reach theirs.
+        // After one session has reached its limit, the run waits for all other sessions that can still reach theirs.
         let is_done = |session: &Session| session.is_over() || (self.feed.ended() && session.is_idle());
         let reached = self.sessions.iter().any(Session::is_over) && self.sessions.iter().all(is_done);
         reached || self.has_exhausted_input() || self.feed.source_failed() || (self.feed.ended() && !self.can_train())
     }
 
-    /// Whether the input ended and a step limit was set that no model can reach without more keyframes. Without a step
-    /// limit the run does not end; the result stays visible.
+    /// Whether the input ended and a model cannot reach its step limit without more keyframes. Without a step limit,
+    /// the run does not end, so that the result stays visible.
     pub fn has_exhausted_input(&self) -> bool {
         self.is_finished() && self.sessions.iter().any(|session| session.n_steps_remaining().is_some_and(|n| n > 0))
     }
@@ -126,7 +126,7 @@ impl Live {
         self.n_evicted
     }
 
-    /// When each keyframe passed the stages from the camera to the first model.
+    /// Times at which each keyframe passed the stages from the camera to the first model.
     pub fn ledger(&self) -> &Ledger {
         &self.ledger
     }
@@ -136,14 +136,14 @@ impl Live {
         &self.sessions
     }
 
-    /// Takes keyframes, trains, draws and publishes in turn. If the GPU fails, it is reopened.
+    /// Runs one cycle: takes keyframes, trains, draws and publishes. Reopens the GPU if it fails.
     pub fn advance(&mut self) -> crate::Result<()> {
         let advanced =
             self.take_keyframes().and_then(|()| self.step()).and_then(|()| self.render()).and_then(|()| self.publish());
         advanced.or_else(|error| self.recoveries.recover(&mut self.sessions, error))
     }
 
-    /// Waits for queued work. If the GPU failed, it is reopened; returns whether that was necessary.
+    /// Waits for queued work. Reopens the GPU if it failed, and returns whether it did.
     pub fn wait(&mut self) -> crate::Result<bool> {
         match self.sessions.iter().try_for_each(Session::wait) {
             Ok(()) => Ok(false),
@@ -151,13 +151,13 @@ impl Live {
         }
     }
 
-    /// What is saved on disk if the run fails now.
+    /// Describes how to continue if the run fails now.
     pub fn describe_recoverable(&mut self) -> String {
         recoveries::describe_recoverable(&mut self.sessions)
     }
 
-    /// Pushes new keyframes to the models: all that wait in real time, the one that is due in lockstep. Does nothing
-    /// during an evaluation.
+    /// Pushes new keyframes to the models: all waiting keyframes in real time, or the keyframe that is due in lockstep.
+    /// Does nothing during an evaluation.
     fn take_keyframes(&mut self) -> crate::Result<()> {
         if self.is_scoring() {
             return Ok(());
@@ -200,8 +200,8 @@ impl Live {
         Ok(())
     }
 
-    /// The next keyframe that was added or removed; `None` if a requested picture may be drawn now, or nothing happens
-    /// for [`IDLE`].
+    /// Waits for the next added or removed keyframe. Returns `None` if a requested picture may be drawn now, or after
+    /// [`IDLE`].
     fn wait_for_change(&mut self) -> Option<FeedItem> {
         if self.hub.n_clients() == 0 {
             return self.feed.next(IDLE);
@@ -214,15 +214,15 @@ impl Live {
                 return Some(item);
             }
             let is_requested = self.budget.may_render() && self.hub.wait_for_request(POLL_PERIOD);
-            self.budget.add_training(before.elapsed()); // Training had nothing to do in this time.
+            self.budget.add_training(before.elapsed()); // Training was idle, so drawing does not delay it.
             if started.elapsed() >= IDLE || is_requested {
                 return None;
             }
         }
     }
 
-    /// Trains a slice once there are enough keyframes; during an evaluation, scores one test image instead. Does
-    /// nothing if a requested picture may be drawn at once.
+    /// Trains for one slice once there are enough keyframes. During an evaluation, scores one test image instead. Does
+    /// not train if a requested picture may be drawn now.
     fn step(&mut self) -> crate::Result<()> {
         self.sessions.iter().try_for_each(Session::check_gpu)?;
         if !self.is_training() {
@@ -256,7 +256,7 @@ impl Live {
             budget.may_render() && hub.wait_for_request(Duration::ZERO)
         })?;
         self.budget.add_training(before.elapsed());
-        // At most one submit is in flight, the one of this slice.
+        // Steps before this slice are complete, because at most one submit is in flight.
         self.ledger.completed(step_before);
         Ok(())
     }
@@ -270,7 +270,7 @@ impl Live {
     fn render(&mut self) -> crate::Result<()> {
         let started = Instant::now();
         if !self.is_training() || self.is_idle() {
-            self.budget = RenderBudget::default(); // Training does not need the time.
+            self.budget = RenderBudget::default(); // Training is idle, so drawing does not delay it.
         }
         while started.elapsed() < MAX_RENDER_TIME && self.budget.may_render() {
             let Some(pending) = self.hub.next_request() else { break };
@@ -280,9 +280,9 @@ impl Live {
             }
             let Some(session) = session_for_method(&mut self.sessions, pending.method()) else {
                 let available_methods =
-                    self.sessions.iter().map(|session| session.kind().name()).collect::<Vec<_>>().join(", ");
+                    self.sessions.iter().map(|session| session.kind().name()).collect::<Vec<_>>().join(" or ");
                 let requested = pending.method().unwrap_or_default().to_owned();
-                pending.fail(&format!("no model with the method {requested:?}, only {available_methods}"));
+                pending.fail(&format!("no model with the method {requested:?}; use {available_methods}"));
                 continue;
             };
             // Work queued before the picture counts as training time.
@@ -311,7 +311,7 @@ impl Live {
         let clock_secs = self.sessions[0].secs();
         if self.scoring_time.as_secs_f64() < SCORE_FRAC * clock_secs && !self.is_scoring() {
             let before = Instant::now();
-            // Only one image at a time, because viewers are waiting.
+            // Scores only one image at a time, so that viewers do not wait.
             self.next_refreshed = (self.next_refreshed + 1) % self.sessions.len();
             let session = &mut self.sessions[self.next_refreshed];
             if session.progress().step > 0 {
@@ -335,9 +335,9 @@ impl Live {
         Ok(())
     }
 
-    /// Ends the input; returns the sessions and the remaining input.
+    /// Ends the input. Returns the sessions and the results of the input.
     pub fn finish(self) -> (Vec<Session>, crate::Result<InputResult>) {
-        // The status stays visible, because viewers wait for the scores.
+        // Changes only the state; the rest of the status stays visible until the scores are published.
         self.hub.set_state("saving");
         (self.sessions, self.feed.finish().map_err(Into::into))
     }
@@ -350,7 +350,7 @@ impl Live {
         self.can_train() && (self.keyframes.len() >= self.start_keyframes || self.feed.ended())
     }
 
-    /// Counting keyframes is not enough: with several cameras, each camera starts with a test keyframe.
+    /// Whether there is a training keyframe. With several cameras, the first keyframe of each is a test keyframe.
     fn can_train(&self) -> bool {
         self.keyframes.iter().any(|keyframe| keyframe.split == Split::Train)
     }
@@ -360,7 +360,7 @@ impl Live {
         self.sessions.iter().all(|session| session.is_idle() || session.has_finished_steps())
     }
 
-    /// Whether each model has reached the step at which the next keyframe is due, or cannot train without it.
+    /// Whether each model has reached the step at which the next keyframe is due, or cannot train further without it.
     fn is_keyframe_due(&self) -> bool {
         let is_due = |(session, at): (&Session, &u64)| {
             session.progress().step >= *at || session.is_idle() || session.has_finished_steps()
@@ -389,11 +389,11 @@ impl Live {
         match change {
             Change::Accepted(keyframe) => {
                 let pushed_at_step = self.sessions[0].progress().step;
-                // A model that has made all its steps gets no more keyframes, so that it equals a model trained alone.
                 self.keyframes.push(keyframe.clone());
                 let mut pushed = Ok(());
+                // A model that has made all its steps gets no more keyframes, so that it equals a model trained alone.
                 for session in self.sessions.iter_mut().filter(|session| !session.has_finished_steps()) {
-                    // Every session holds the keyframe, even after a GPU failure, so that a restored model gets it.
+                    // Continues after a GPU failure, so that every session holds the keyframe for its restored model.
                     pushed = pushed.and(session.push(&keyframe));
                 }
                 if let Some(input) = times {
@@ -418,13 +418,13 @@ impl Live {
 
 /// Options of a live run.
 pub struct LiveOptions {
-    /// What determines when keyframes are taken.
+    /// When the models receive keyframes.
     pub pace: Pace,
     /// Number of keyframes with which training starts.
     pub start_keyframes: usize,
     /// Notes shown on the page.
     pub notes: Vec<String>,
-    /// Opens the GPU again after a failure.
+    /// Reopens the GPU after a failure.
     pub open_gpu: OpenGpu,
 }
 

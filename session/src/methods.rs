@@ -1,4 +1,4 @@
-//! Options and names of models on the command line and in rig files.
+//! Names and options of models, as given on the command line and in rig files.
 
 use crate::Error;
 use crate::run_folder::{expect_model, expect_one_model};
@@ -11,7 +11,7 @@ use std::sync::Arc;
 use trainer::gpu::Gpu;
 use trainer::{CommonOptions, LoadedModel, ModelKind, ModelSpec};
 
-/// Values of options that only some methods have, by name.
+/// Names and values of options that only some methods have.
 pub type Settings = Vec<(&'static str, Value)>;
 
 /// Maximum number of splats.
@@ -21,14 +21,16 @@ pub const COUNT: &str = "count";
 /// Degree of the spherical harmonics.
 pub const SH_DEGREE: &str = "sh_degree";
 
-/// Names of kinds as prose: `splat`, `tsdf and splat`, `tsdf, nerf and splat`.
+/// Lists kinds in prose: `splat`, `tsdf and splat`, `tsdf, nerf and splat`.
 pub fn describe(kinds: &[ModelKind]) -> String {
     listed(&kinds.iter().map(|kind| kind.name()).collect::<Vec<_>>(), "and")
 }
 
-/// The kind of model at a path; `None` if it is not a model.
+/// The kind of the model at a path; `None` if there is no model.
 ///
-/// # Errors If the folder contains several models, or its `model.json` is invalid.
+/// # Errors
+///
+/// If the folder contains several models, or its `model.json` is invalid.
 pub fn kind_of(path: &Path) -> crate::Result<Option<ModelKind>> {
     expect_one_model(path)?;
     Ok(ModelKind::of_saved(path)?)
@@ -40,17 +42,17 @@ pub fn load(gpu: Arc<Gpu>, model: &Path) -> crate::Result<LoadedModel> {
     Ok(trainer::load(gpu, model)?)
 }
 
-/// The methods that a rig file names.
+/// The methods listed in a rig file.
 ///
 /// # Errors
 ///
-/// If it names an unknown one.
+/// If a method is unknown.
 pub fn methods_of(rig: &Rig) -> crate::Result<Vec<ModelKind>> {
     let known: Vec<_> = ModelKind::ALL.iter().map(|kind| (kind.name(), *kind)).collect();
     Ok(rig.train.methods.resolve(&known)?)
 }
 
-/// Options from a rig file. `steps` is the number of steps if it is fixed in advance.
+/// Options from a rig file. `steps` is the number of training steps, if known in advance.
 pub fn options(train: &Train, steps: Option<u64>) -> (CommonOptions, Settings) {
     let defaults = CommonOptions::default();
     let common = CommonOptions {
@@ -63,7 +65,7 @@ pub fn options(train: &Train, steps: Option<u64>) -> (CommonOptions, Settings) {
     (common, max_splats.into_iter().chain([(SH_DEGREE, train.sh_degree.into())]).collect())
 }
 
-/// Models of these kinds with common options, and with the settings that each of them has.
+/// One model spec per kind. Each gets the common options and those `settings` that its method has.
 pub fn specs(kinds: &[ModelKind], common: &CommonOptions, settings: &Settings) -> Result<Vec<ModelSpec>, Error> {
     let spec = |kind: &ModelKind| ModelSpec::new(*kind, common.clone(), settings);
     kinds.iter().map(spec).collect::<Result<_, _>>().map_err(|error| Error::BadInput(error.to_string()))

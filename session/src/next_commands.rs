@@ -1,4 +1,4 @@
-//! Commands to run after training. They work as printed, in the folder in which training was started.
+//! Suggested commands to run after training. They work as printed in the folder where training was started.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -10,28 +10,28 @@ use trainer::method_entry::Export;
 pub struct DataSource {
     /// Dataset folder or recording; `None` if a live run was not recorded.
     pub path: Option<PathBuf>,
-    /// Flags with which `eval` loads the same images.
+    /// Flags that make `eval` load the same images.
     pub flags: Vec<String>,
     /// Names of the images, by camera and stamp.
     pub image_names: BTreeMap<(String, i64), String>,
 }
 
 impl DataSource {
-    /// The file name of an image, or without one its camera and stamp.
+    /// The file name of an image, or its camera and stamp if no file name is known.
     pub fn image_name(&self, camera: &str, stamp_nanos: i64) -> String {
         let known = self.image_names.get(&(camera.to_owned(), stamp_nanos));
         known.cloned().unwrap_or_else(|| format!("{camera}/{stamp_nanos}"))
     }
 }
 
-/// What the commands need to know about a saved model.
+/// Properties of a saved model that its commands depend on.
 #[derive(Clone, Copy, Debug)]
 pub struct SavedModel<'a> {
     /// The method.
     pub kind: ModelKind,
     /// Folder of the model.
     pub folder: &'a Path,
-    /// The images that it was trained on.
+    /// The images that the model was trained on.
     pub data: &'a DataSource,
     /// Number of test images.
     pub n_tests: usize,
@@ -65,7 +65,7 @@ pub fn for_models(models: &[SavedModel<'_>]) -> Vec<NextCommand> {
             let data = argument(data);
             words.extend([&*data, "--keyframes", &list]);
             words.extend(model.data.flags.iter().map(String::as_str));
-            add("score it again", &words);
+            add("score the model again", &words);
         }
         if let Some(Export { format, contents, .. }) = model.kind.entry().exports.first() {
             let out = argument(&unused_file(&model_name(model.folder), format));
@@ -87,7 +87,7 @@ pub fn lines(commands: &[NextCommand]) -> Vec<String> {
     commands.iter().map(line).collect()
 }
 
-/// The folder to view: that of a single model, or the parent folder of several models.
+/// The folder to view: the folder of a single model, or the parent folder of several models.
 fn common_folder<'a>(models: &[SavedModel<'a>]) -> Option<&'a Path> {
     match models {
         [] => None,
@@ -96,19 +96,19 @@ fn common_folder<'a>(models: &[SavedModel<'a>]) -> Option<&'a Path> {
     }
 }
 
-/// Base name of files exported from a model: that of its folder, which is the method name in a run of several methods.
+/// Base name for exported files: the name of the model's folder. In a run of several methods, that is the method name.
 fn model_name(folder: &Path) -> String {
     folder.file_name().map_or_else(|| "model".to_owned(), |name| name.to_string_lossy().into_owned())
 }
 
-/// A file name in the current folder that does not exist yet, because `export` does not overwrite files.
+/// An unused file name in the current folder; `export` does not overwrite files.
 fn unused_file(name: &str, extension: &str) -> PathBuf {
     let numbered =
         |n: u32| PathBuf::from(if n == 1 { format!("{name}.{extension}") } else { format!("{name}-{n}.{extension}") });
     (1..100).map(numbered).find(|file| !file.exists()).unwrap_or_else(|| numbered(100))
 }
 
-/// A path as a positional argument: a leading hyphen would make it a flag.
+/// A path as a positional argument. A path that starts with a hyphen would be parsed as a flag, so `./` is prepended.
 fn argument(path: &Path) -> String {
     let text = path.to_string_lossy();
     if text.starts_with('-') { format!("./{text}") } else { text.into_owned() }
@@ -128,7 +128,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn shell_reads_quoted_words_back() {
+    fn quoted_words_round_trip_through_the_shell() {
         for word in ["plain/path-1.spz", "two words", "it's", "$HOME `x` \"y\" \\ *", "", "naïve", "a\nb"] {
             let output = std::process::Command::new("sh").args(["-c", &format!("printf %s {}", quoted(word))]).output();
             assert_eq!(String::from_utf8_lossy(&output.expect("sh starts").stdout), word);

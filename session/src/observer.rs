@@ -1,4 +1,4 @@
-//! Reports of a session to the program that runs it.
+//! Events that a session sends to the program that runs it.
 
 use crate::evaluate::Scores;
 use serde::Serialize;
@@ -7,7 +7,7 @@ use trainer::Progress;
 
 /// Receives the events of a session, for example to print them.
 pub trait Observer {
-    /// Takes an event.
+    /// Handles an event.
     fn on_event(&mut self, event: &SessionEvent<'_>);
 }
 
@@ -32,7 +32,7 @@ pub enum SessionEvent<'a> {
 /// The state of training.
 #[derive(Clone, Debug)]
 pub struct SessionProgress {
-    /// Name of the model's primitive, in the singular.
+    /// Singular name of the model's primitive, such as `splat`.
     pub primitive: &'static str,
     /// Training time, seconds.
     pub seconds: f64,
@@ -42,7 +42,7 @@ pub struct SessionProgress {
     pub psnr: Option<f64>,
 }
 
-/// Result of a scheduled evaluation. Serialized, it is the event `eval`.
+/// Result of a scheduled evaluation, serialized as the event `eval`.
 #[derive(Clone, Debug, Serialize)]
 pub struct Evaluation {
     pub(crate) event: &'static str,
@@ -60,14 +60,14 @@ pub struct Evaluation {
     pub primitives: u64,
     /// Size of the model, bytes.
     pub bytes: u64,
-    /// Time of a step, milliseconds; `None` before the first.
+    /// Duration of a step, milliseconds; `None` before the first step.
     pub step_millis: Option<f64>,
-    /// Name of the model's primitive, in the singular.
+    /// Singular name of the model's primitive, such as `splat`.
     #[serde(skip)]
     pub primitive: &'static str,
 }
 
-/// Result of training. Serialized, it is the event `done`.
+/// Result of training, serialized as the event `done`.
 #[derive(Clone, Debug, Serialize)]
 pub struct DoneEvent<'a> {
     pub(crate) event: &'static str,
@@ -86,28 +86,28 @@ pub struct DoneEvent<'a> {
     pub bytes: u64,
     /// Folder of the model.
     pub out: &'a Path,
-    /// Hash of the saved model.
+    /// SHA-256 of the saved model.
     pub checkpoint_sha256: &'a str,
 }
 
-/// GPU time of each kernel in a step. Serialized, it is the event `profile`.
+/// GPU time of each kernel in a step, serialized as the event `profile`.
 #[derive(Clone, Debug, Serialize)]
 pub struct ProfileEvent<'a> {
     pub(crate) event: &'static str,
     /// Name of the method.
     pub method: &'static str,
-    /// Names and milliseconds.
+    /// Names of the kernels and their GPU time, milliseconds.
     pub passes: &'a [(&'static str, f64)],
 }
 
-/// What is known about a model after it was saved and scored.
+/// Final report on a model that was saved and scored.
 #[derive(Clone, Debug)]
 pub struct FinishedReport<'a> {
     /// The result.
     pub done: &'a DoneEvent<'a>,
     /// GPU time of each kernel, if profiling was requested.
     pub profile: Option<ProfileEvent<'a>>,
-    /// Name of the model's primitive, in the singular.
+    /// Singular name of the model's primitive, such as `splat`.
     pub primitive: &'static str,
     /// Whether the page `report.html` was written.
     pub has_page: bool,

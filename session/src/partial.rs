@@ -1,6 +1,6 @@
-//! Files and folders that are being written: complete in the end, or removed.
+//! Removes output files and folders that were not written completely.
 //!
-//! A [`Partial`] removes its files unless they are kept, both after an error and after a signal.
+//! A [`Partial`] removes its files after an error or a signal, unless [`Partial::keep`] was called.
 
 use parking_lot::{Mutex, MutexGuard};
 use std::collections::BTreeSet;
@@ -9,18 +9,18 @@ use std::path::{Path, PathBuf};
 /// The files and folders that this process is writing.
 static IN_PROGRESS: Mutex<BTreeSet<PathBuf>> = Mutex::new(BTreeSet::new());
 
-/// Files or folders being written; removed on drop unless they are kept.
+/// Files or folders being written; removed on drop unless [`Self::keep`] is called.
 #[derive(Debug)]
 #[must_use = "dropping it removes its files"]
 pub struct Partial(Vec<PathBuf>);
 
 impl Partial {
-    /// A file that will be written, under its own name or, until it is complete, with the suffix `.part`.
+    /// A file that will be written, either directly or as a temporary file with the suffix `.part`.
     pub fn file(path: &Path) -> Self {
         Self::register(vec![path.to_owned(), trainer::atomic_file::partial_path(path)])
     }
 
-    /// A folder that will be filled with these entries; the folder itself, if it does not exist yet.
+    /// A folder that will be filled with `entries`. If the folder exists already, only the entries are removed on drop.
     pub fn folder(path: &Path, entries: &[&str]) -> Self {
         if path.exists() {
             return Self::register(entries.iter().map(|entry| path.join(entry)).collect());
@@ -28,14 +28,14 @@ impl Partial {
         Self::register(vec![path.to_owned()])
     }
 
-    /// Files that already exist belong to someone else and are not removed.
+    /// Registers files for removal, except those that already exist.
     fn register(paths: Vec<PathBuf>) -> Self {
         let paths: Vec<PathBuf> = paths.into_iter().filter(|path| !path.exists()).collect();
         IN_PROGRESS.lock().extend(paths.iter().cloned());
         Self(paths)
     }
 
-    /// Keeps the files, because they are complete.
+    /// Keeps the files once they are complete.
     pub fn keep(mut self) {
         let paths = std::mem::take(&mut self.0);
         IN_PROGRESS.lock().retain(|path| !paths.contains(path));
@@ -52,13 +52,13 @@ impl Drop for Partial {
     }
 }
 
-/// No new file is started while this exists.
+/// Prevents the start of new files as long as it exists.
 #[must_use = "dropping it allows new files"]
 pub struct NoNewFiles {
     _in_progress: MutexGuard<'static, BTreeSet<PathBuf>>,
 }
 
-/// Removes all partial files, before the process exits.
+/// Removes all partial files. To be called before the process exits.
 pub fn remove_all() -> NoNewFiles {
     let in_progress = IN_PROGRESS.lock();
     in_progress.iter().for_each(|path| remove(path));
@@ -69,7 +69,7 @@ fn remove(path: &Path) {
     let removed = if path.is_dir() { std::fs::remove_dir_all(path) } else { std::fs::remove_file(path) };
     match removed {
         Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
-            log::warn!("cannot remove the incomplete {}: {error}", path.display());
+            log::warn!("cannot remove the incomplete output {}: {error}", path.display());
         }
         _ => {}
     }

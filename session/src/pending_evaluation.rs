@@ -6,22 +6,22 @@ use std::collections::VecDeque;
 use std::sync::Arc;
 use std::time::Duration;
 
-/// Time limit for scoring: if drawing is slow, fewer images are scored. On a CPU, a neural field takes seconds per
+/// Time limit for scoring. Fewer images are scored if rendering is slow: on a CPU, a neural field takes seconds per
 /// image.
 const MAX_SCORING: Duration = Duration::from_secs(60);
 
 /// An evaluation in progress.
 pub(crate) struct PendingEvaluation {
-    /// Training time when the evaluation was due, seconds.
+    /// Training time at which the evaluation was due, seconds.
     pub seconds: f64,
-    /// Ordered so that the first images scored are already spread evenly over all.
+    /// Images left to score, ordered so that the scored ones are evenly spread at any time.
     remaining: VecDeque<Arc<Keyframe>>,
     images: Vec<ImageScores>,
     spent: Duration,
 }
 
 impl PendingEvaluation {
-    /// An evaluation due at `seconds` that scores at most `max_images` of these test keyframes.
+    /// An evaluation due at `seconds` that scores at most `max_images` of the test keyframes.
     pub(crate) fn new<'a>(
         seconds: f64,
         tests: impl ExactSizeIterator<Item = &'a Arc<Keyframe>>,

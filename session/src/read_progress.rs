@@ -1,17 +1,17 @@
 //! Progress of reading and preparing images.
 
-/// How many images were read or prepared so far.
+/// Number of images read or prepared so far.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ReadProgress {
-    /// What is counted: `images`, `keyframes` or `depth images`.
+    /// Noun for the items: `images`, `keyframes` or `depth images`.
     pub noun: &'static str,
-    /// Number of finished ones.
+    /// Number of finished items.
     pub n_done: usize,
-    /// Number of all; `None` if unknown.
+    /// Total number of items; `None` if unknown.
     pub n_all: Option<usize>,
 }
 
-/// Receives the progress, possibly from several threads.
+/// Callback for progress, possibly called from several threads.
 pub type OnReadProgress<'a> = &'a (dyn Fn(ReadProgress) + Sync);
 
 /// Ignores the progress.

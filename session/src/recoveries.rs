@@ -1,4 +1,4 @@
-//! Recovery from a GPU failure during a run: every model continues on a reopened device from its newest checkpoint.
+//! Recovers from a GPU failure during a run: reopens the device and continues every model from its newest checkpoint.
 
 use crate::Error;
 use crate::error::Context;
@@ -7,19 +7,19 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 use trainer::gpu::Gpu;
 
-/// How many times a run tries to reopen the GPU.
+/// Maximum number of attempts to reopen the GPU.
 const MAX_RECOVERIES: u32 = 3;
-/// After this time without a failure the count restarts: a run of several days may fail occasionally.
+/// The attempt count is reset after this time without a failure, because a run of several days may fail occasionally.
 const RESET_COUNT_AFTER: Duration = Duration::from_secs(600);
-/// Pause between attempts: a driver reset takes a moment.
+/// Pause between attempts, because a driver reset takes time.
 const RETRY_DELAY: Duration = Duration::from_secs(1);
 
-/// What is saved of these sessions if they fail now: a sentence without a period, or empty if nothing is known.
+/// Describes how to continue these sessions if they fail now, as a sentence without a period. Empty without recovery.
 pub fn describe_recoverable(sessions: &mut [Session]) -> String {
     sessions.iter_mut().filter_map(Session::describe_recoverable).collect::<Vec<_>>().join("; ")
 }
 
-/// Opens the GPU again after a failure.
+/// Opens the GPU, also after a failure.
 pub type OpenGpu = fn() -> crate::Result<Arc<Gpu>>;
 
 /// Counts the attempts of a run to reopen the GPU.
@@ -31,14 +31,14 @@ pub struct Recoveries {
 }
 
 impl Recoveries {
-    /// No attempts so far.
+    /// A counter without attempts.
     #[must_use]
     pub fn new(open_gpu: OpenGpu) -> Self {
         Self { open_gpu, n: 0, last: None }
     }
 
-    /// Continues all sessions on a reopened device if the GPU caused the error. Otherwise, and if all attempts fail,
-    /// returns the error.
+    /// Continues all sessions on a reopened device if the GPU caused `error`. Returns an error if the cause was another
+    /// one, or if all attempts fail.
     pub fn recover(&mut self, sessions: &mut [Session], error: crate::Error) -> crate::Result<()> {
         if !error.is_gpu_error() || !sessions.iter().all(Session::can_restart) {
             return Err(error);
@@ -56,7 +56,7 @@ impl Recoveries {
             log::warn!("{error:#}: reopening the GPU, attempt {} of {MAX_RECOVERIES}", self.n);
             match restart_all(sessions, self.open_gpu) {
                 Ok(()) => {
-                    // Several sessions share one clock.
+                    // All sessions share one clock, so the time is excluded only once.
                     sessions.iter().take(1).for_each(|session| session.exclude(began.elapsed()));
                     self.last = Some(Instant::now());
                     return Ok(());
@@ -72,7 +72,7 @@ impl Recoveries {
 }
 
 fn restart_all(sessions: &mut [Session], open_gpu: OpenGpu) -> crate::Result<()> {
-    sessions.iter_mut().for_each(Session::drop_model); // The new model may need its memory.
+    sessions.iter_mut().for_each(Session::drop_model); // Frees memory for the new models.
     let gpu = open_gpu().context("cannot reopen the GPU")?;
     sessions.iter_mut().try_for_each(|session| session.restart_on(&gpu))
 }

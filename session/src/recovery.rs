@@ -1,4 +1,4 @@
-//! What a model needs to recover from a GPU failure, and the errors of one.
+//! Data for recovering a model from a GPU failure, and messages that describe how to continue.
 
 use crate::decisions::Settings;
 use crate::run_folder::CHECKPOINT;
@@ -7,13 +7,13 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use trainer::ModelSpec;
 
-/// What a session needs to continue on another device.
+/// Data with which a session continues on another device.
 pub struct Recovery {
     /// Method and options of the model.
     pub model_spec: ModelSpec,
     /// Folder of the run.
     pub folder: PathBuf,
-    /// Folder of the checkpoint that the run was resumed from, if it was.
+    /// Folder of the checkpoint that the run was resumed from; `None` for a new run.
     pub resumed: Option<PathBuf>,
     /// Keyframes that the resumed model was trained on.
     pub known: Vec<Arc<Keyframe>>,
@@ -24,7 +24,7 @@ pub struct Recovery {
 }
 
 impl Recovery {
-    /// What can be continued if the model cannot be saved, as a sentence without a period.
+    /// Describes how to continue if the model cannot be saved, as a sentence without a period.
     pub fn describe_recoverable(&self, has_checkpoint: bool) -> String {
         let Self { folder, resume_command, .. } = self;
         match (has_checkpoint, &self.resumed) {
@@ -43,7 +43,7 @@ fn in_folder(folder: &Path) -> String {
     folder.join(CHECKPOINT).display().to_string()
 }
 
-/// Adds what is saved on disk to an error of the GPU.
+/// Adds a description of how to continue to a GPU error.
 pub fn with_recoverable(error: crate::Error, recoverable: &str) -> crate::Error {
     if error.is_gpu_error() && !recoverable.is_empty() {
         error.with_context(format!("the GPU failed at the end of the run; {recoverable}"))

@@ -1,14 +1,14 @@
-//! Limits the share of time that pictures take from training.
+//! Limits the share of time that is spent on drawing pictures during training.
 //!
-//! Time spent on training is credited to pictures one for one. A picture is drawn at once while credit is left, so
-//! training keeps at least half of the time however many pictures are requested.
+//! Each second of training adds one second of credit for pictures. Pictures are drawn immediately while credit is left.
+//! Training therefore keeps at least half of the time, unless a single picture takes longer than the maximum debt.
 
 use std::time::Duration;
 
-/// Maximum credit, seconds; more if the last slice of training took longer. It allows a burst of pictures of this
-/// length.
+/// Maximum credit, seconds, which is the maximum length of a burst of pictures. After a longer slice of training, the
+/// maximum is the length of that slice.
 const MAX_CREDIT_SECS: f64 = 0.1;
-/// Maximum debt, seconds: after a picture that takes longer, training catches up on this much only.
+/// Maximum debt, seconds. After a picture that takes longer, training makes up for this time only.
 const MAX_DEBT_SECS: f64 = 1.0;
 
 /// The time available for pictures.

@@ -35,12 +35,12 @@ impl Replay {
         model_spec.check().map_err(|error| Error::BadInput(format!("{}: line 1: {error}", path.display())))?;
         let replay = Self { path: path.to_owned(), decisions, model_spec };
         if replay.decisions.pushed().next().is_none() {
-            return Err(Error::InsufficientData(format!("{} contains no keyframe, nothing to replay", replay.name())));
+            return Err(Error::InsufficientData(format!("{} contains no keyframe to replay", replay.name())));
         }
         Ok(replay)
     }
 
-    /// Loads exactly the keyframes in the log; [`Self::check_data`] checks that they are the same.
+    /// Loads exactly the keyframes that the log lists. [`Self::check_data`] checks that their contents are the same.
     pub fn load_data(&self, path: &Path, rig: Option<PathBuf>, progress: OnReadProgress<'_>) -> crate::Result<Data> {
         let pushed = || self.decisions.pushed();
         let list: KeyframeList = pushed()
@@ -57,7 +57,7 @@ impl Replay {
         if !self.decisions.is_complete() {
             let last = self.decisions.entries.last().map_or(0, |entry| entry.step);
             let name = self.name();
-            data.data_losses.push(format!("{name} is truncated: replaying up to step {last}, its last one"));
+            data.data_losses.push(format!("{name} is truncated: replaying up to its last step, {last}"));
         }
         Ok(data)
     }
@@ -75,8 +75,8 @@ impl Replay {
             };
             if !pushed.matches(keyframe) {
                 return Err(Error::InsufficientData(format!(
-                    "image {stamp} of camera {camera:?} has other pixels, depth, intrinsics or pose in {shown} than in \
-                     {name}"
+                    "image {stamp} of camera {camera:?} differs in pixels, depth, intrinsics or pose between {shown} \
+                     and {name}"
                 )));
             }
         }
@@ -88,8 +88,8 @@ impl Replay {
         depth_from::check_same(&self.name(), self.decisions.settings.depth_from.as_deref(), sha256)
     }
 
-    /// Checks that training starts where the log does. `from_step`: the step of the checkpoint that training continues
-    /// from.
+    /// Checks that training starts at the same step as the log. `from_step`: step of the checkpoint that training
+    /// continues from.
     pub fn check_start(&self, from_step: Option<u64>) -> Result<(), Error> {
         let name = self.name();
         match (self.decisions.settings.from_step, from_step) {
@@ -109,7 +109,7 @@ impl Replay {
         self.model_spec.clone()
     }
 
-    /// Warns if the GPU adapter differs from that of the log.
+    /// Logs a warning if the GPU adapter differs from the adapter in the log.
     pub fn check_adapter(&self, adapter: &str) {
         let logged_adapter = &self.decisions.settings.adapter;
         if logged_adapter != adapter {
@@ -153,7 +153,7 @@ impl Replay {
         Ok(())
     }
 
-    /// The settings as keys of a rig file, so that the resolved rig file that is written is correct.
+    /// The logged settings as keys of a rig file, so that the resolved rig file lists the settings of the replay.
     fn overrides(&self) -> Vec<Override> {
         let ModelSpec { kind, options } = &self.model_spec;
         let specific = |key, name: &str| Some(Override::new(key, options.specific.get(name)?.as_i64()?));

@@ -1,4 +1,4 @@
-//! The folder of a run, and the files in it.
+//! The folder of a run and its files.
 
 use crate::Error;
 use crate::error::Context;
@@ -17,7 +17,7 @@ use trainer::{Method, ModelKind};
 const RECORDING_EXTENSION: &str = "mcap";
 /// Parent folder of runs without `--out`.
 const RUNS: &str = "runs";
-/// Folder in which a model is saved until it is complete.
+/// Temporary subfolder in which a model is saved until it is complete.
 const PARTIAL_MODEL: &str = "model.part";
 /// The checkpoint in the folder of a run.
 pub const CHECKPOINT: &str = "training.ckpt";
@@ -25,7 +25,7 @@ pub const CHECKPOINT: &str = "training.ckpt";
 const LOCK: &str = ".lock";
 const SECS_PER_DAY: u64 = 86_400;
 
-/// Returns an error if a folder contains one or several models, so that results are never mixed or overwritten.
+/// Returns an error if a folder contains any model, so that results are never mixed or overwritten.
 pub fn check_no_model(folder: &Path) -> Result<(), Error> {
     let subfolders = [PathBuf::new()].into_iter().chain(ModelKind::ALL.iter().map(|kind| PathBuf::from(kind.name())));
     let mut files =
@@ -40,8 +40,7 @@ pub fn check_no_model(folder: &Path) -> Result<(), Error> {
     }
 }
 
-/// Returns an error if a folder contains one or several interrupted runs, because a new run would replace their
-/// checkpoints.
+/// Returns an error if a folder contains any interrupted run, because a new run would replace its checkpoint.
 pub fn check_no_unfinished_run(out: &Path) -> Result<(), Error> {
     let folders = std::iter::once(out.to_owned()).chain(ModelKind::ALL.iter().map(|kind| out.join(kind.name())));
     match folders.into_iter().find(|folder| folder.join(CHECKPOINT).exists()) {
@@ -66,7 +65,7 @@ pub fn check_not_data_folder(out: &Path, data: &Path) -> Result<(), Error> {
     }
 }
 
-/// Returns an error that names the subfolders if a folder contains models of several methods where one model is needed.
+/// Returns an error if a folder contains models only in subfolders for several methods. The error lists the subfolders.
 pub fn expect_one_model(folder: &Path) -> Result<(), Error> {
     let holds_one = |folder: &Path| holds_model(folder) || folder.join(CHECKPOINT).exists();
     let inside: Vec<String> = ModelKind::ALL
@@ -98,7 +97,7 @@ pub fn expect_model(model: &Path) -> crate::Result<()> {
         let hint = if has_checkpoint { " but has a checkpoint: train --resume continues from it" } else { "" };
         bail!("{shown} contains no model{hint}");
     }
-    // A part of a model may have the extension of a complete one.
+    // One file of a model with several files may have the extension of a single-file model.
     let is_part = |kind: &ModelKind| {
         let is_complete = |file: &str| kind.entry().single_file.is_some() && kind.entry().files.last() == Some(&file);
         kind.entry().files.iter().any(|file| model.ends_with(file) && !is_complete(file))
@@ -119,8 +118,8 @@ fn holds_model(folder: &Path) -> bool {
     ModelKind::model_files().any(|name| folder.join(name).exists())
 }
 
-/// The models at a path: the path itself, or the models in the folder of a run of several methods. Returns the same
-/// errors as [`expect_model`]. Methods without a model are left out, unless none has one.
+/// The models at a path: the path itself or, for a run of several methods, the subfolders that contain a model. If
+/// there is no model, returns the error of [`expect_model`].
 pub fn models_at(path: &Path) -> crate::Result<Vec<PathBuf>> {
     let inside = ModelKind::ALL.iter().map(|kind| path.join(kind.name())).filter(|folder| holds_model(folder));
     let inside: Vec<PathBuf> = inside.collect();
@@ -134,15 +133,15 @@ pub fn models_at(path: &Path) -> crate::Result<Vec<PathBuf>> {
 /// Folders created by this run. They are removed if the run is rejected.
 #[derive(Debug, Default)]
 pub struct CreatedFolders {
-    /// Folders of the run, each before its parent.
+    /// Folders of the run, the innermost first.
     leaves: Vec<PathBuf>,
-    /// Their parents, each before its own parent.
+    /// Parents of `leaves` that were also created, the innermost first.
     parents: Vec<PathBuf>,
 }
 
 impl CreatedFolders {
     /// Creates the folder of each model of a run: the requested folder for a single model, else a subfolder per method.
-    /// Writes the resolved rig file, if any, into each of them, with only the method of that model.
+    /// Writes the resolved rig file, if any, into each folder; in a subfolder, it lists only the method of that model.
     pub fn make_each(
         &mut self,
         requested: Option<&Path>,
@@ -184,7 +183,7 @@ impl CreatedFolders {
                 self.leaves.insert(0, leaf.clone());
                 self.parents.splice(0..0, parents.iter().cloned());
             }
-            (Some(_), None) => {} // It existed before.
+            (Some(_), None) => {} // The folder already existed.
         }
         Ok(created)
     }
@@ -201,14 +200,14 @@ impl CreatedFolders {
             return;
         }
         let removed = self.leaves.iter().try_for_each(std::fs::remove_dir_all);
-        // A folder into which another program wrote meanwhile is not empty, so it is kept.
+        // `remove_dir` keeps a folder that is not empty because another program wrote into it.
         let removed = removed.and_then(|()| self.parents.iter().try_for_each(std::fs::remove_dir));
         if let Err(error) = removed {
             log::debug!("cannot remove a folder of the rejected run: {error}");
         }
     }
 
-    /// Removes the created folders if the command was rejected, because of bad input or insufficient data.
+    /// Removes the created folders if the command was rejected because of bad input or insufficient data.
     pub fn keep_unless(self, is_rejected: bool) {
         if is_rejected {
             self.remove_created();
@@ -229,7 +228,7 @@ fn make(requested: Option<&Path>) -> crate::Result<PathBuf> {
     make_in(Path::new(RUNS), "")
 }
 
-/// Creates a folder in the system's temporary folder, for a model that cannot be saved in the folder of its run.
+/// Creates a folder in the system's temporary folder, for a model that cannot be saved in its run folder.
 pub fn make_fallback_folder() -> crate::Result<PathBuf> {
     make_in(&std::env::temp_dir(), "fieldrig-")
 }
@@ -262,7 +261,7 @@ fn lock(folder: &Path) -> crate::Result<()> {
     let path = folder.join(LOCK);
     let file = std::fs::File::create(&path).with_context(|| format!("cannot write {}", path.display()))?;
     match file.try_lock() {
-        Ok(()) => std::mem::forget(file), // The system releases it when the process ends in any way.
+        Ok(()) => std::mem::forget(file), // The system releases the lock when the process ends.
         Err(std::fs::TryLockError::WouldBlock) => {
             let message = format!("--out {}: another run uses this folder; give another one", folder.display());
             return Err(Error::BadInput(message));
@@ -276,21 +275,21 @@ fn lock(folder: &Path) -> crate::Result<()> {
 pub fn save_model(method: &mut dyn Method, folder: &Path) -> crate::Result<()> {
     let partial_folder = folder.join(PARTIAL_MODEL);
     if partial_folder.exists() {
-        // Left by a run that was killed while saving.
+        // An earlier run was killed while saving.
         std::fs::remove_dir_all(&partial_folder)
             .with_context(|| format!("cannot remove {}", partial_folder.display()))?;
     }
     if let Err(error) = method.save(&partial_folder) {
-        let _ = std::fs::remove_dir_all(&partial_folder); // Incomplete, and wastes space.
+        let _ = std::fs::remove_dir_all(&partial_folder); // Frees the disk space of the incomplete model.
         return Err(error.into());
     }
-    // The last file of a method completes its model.
+    // A model counts as complete once the last file of its method is in place.
     for name in ModelKind::model_files().filter(|name| partial_folder.join(name).exists()) {
         let path = folder.join(name);
         std::fs::rename(partial_folder.join(name), &path)
             .with_context(|| format!("cannot write {}", path.display()))?;
     }
-    // Fails if the folder is not empty, so that a file missing from the list above is not lost.
+    // Fails if the folder is not empty, so that files missing from `model_files` are not lost.
     std::fs::remove_dir(&partial_folder).with_context(|| format!("cannot remove {}", partial_folder.display()))
 }
 
@@ -301,12 +300,12 @@ pub fn write_json(path: &Path, report: &impl Serialize) -> crate::Result<()> {
     write_atomic(path, &text)
 }
 
-/// Writes a file that is either complete or absent.
+/// Writes a file atomically: `path` never refers to an incomplete file.
 pub fn write_atomic(path: &Path, text: &str) -> crate::Result<()> {
     Ok(trainer::atomic_file::write(path, |file| file.write_all(text.as_bytes()))?)
 }
 
-/// Writes the keyframes of a run and their splits, for `--keyframes`.
+/// Writes the list of keyframes and their splits that `--keyframes` accepts.
 pub fn write_keyframe_list(path: &Path, keyframes: &[Arc<Keyframe>]) -> crate::Result<()> {
     write_atomic(path, &keyframe::list_text(keyframes.iter()))
 }
@@ -334,7 +333,7 @@ pub fn hex(bytes: &[u8]) -> String {
     bytes.iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
-/// `20261121-093000` for a time since 1970, UTC.
+/// Formats a UTC time since 1970 as `20261121-093000`.
 fn name_from_time(since_epoch: Duration) -> String {
     let secs = since_epoch.as_secs();
     let (year, month, day) = date_from_days(secs / SECS_PER_DAY);
@@ -342,7 +341,7 @@ fn name_from_time(since_epoch: Duration) -> String {
     format!("{year:04}{month:02}{day:02}-{:02}{:02}{:02}", secs_of_day / 3600, secs_of_day / 60 % 60, secs_of_day % 60)
 }
 
-/// Year, month and day of a day counted from 1 January 1970.
+/// Converts days since 1 January 1970 to year, month and day.
 fn date_from_days(mut days: u64) -> (u64, usize, u64) {
     let is_leap = |year: u64| year.is_multiple_of(4) && (!year.is_multiple_of(100) || year.is_multiple_of(400));
     let mut year = 1970;
@@ -359,7 +358,7 @@ fn date_from_days(mut days: u64) -> (u64, usize, u64) {
     (year, month_ix + 1, days + 1)
 }
 
-/// Whether the file name is that of a recording.
+/// Whether a path has the file extension of recordings.
 pub fn is_recording(path: &Path) -> bool {
     path.extension().is_some_and(|extension| extension == RECORDING_EXTENSION)
 }
@@ -480,7 +479,7 @@ mod tests {
     }
 
     #[test]
-    fn checksum_covers_contents_and_names() {
+    fn checksum_covers_model_files_only() {
         let folder = tempfile::tempdir().expect("folder");
         assert!(checkpoint_sha256(folder.path()).is_err(), "no model, no checksum");
         std::fs::write(folder.path().join("splats.ply"), b"abc").expect("file");

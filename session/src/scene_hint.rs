@@ -1,4 +1,4 @@
-//! The first view: around the point that the cameras look at, or without cameras around the model.
+//! The initial view of a scene, centered on the point that the cameras look at or, without cameras, on the model.
 
 use keyframe::Keyframe;
 use kinematics::Transform;
@@ -7,23 +7,23 @@ use std::sync::Arc;
 use trainer::Bounds;
 use viz::SceneHint;
 
-/// Assumed distance of the scene ahead of the cameras where their axes do not determine it, meters.
+/// Assumed distance of the scene from each camera if the optical axes do not determine it, meters.
 const PRIOR_DISTANCE_M: f64 = 0.5;
-/// Weight of that assumption relative to one camera's axis, so small that it only matters in directions that no axis
-/// determines.
+/// Weight of the assumed distance relative to one optical axis. It matters only in directions that the axes do not
+/// constrain.
 const PRIOR_WEIGHT: f64 = 0.01;
 
-/// Distance of a view from outside, in radii of the model: most of the model fits into a view of 50 degrees.
+/// Distance of an outside view, in radii of the model. Most of the model fits into a field of view of 50 degrees.
 const DISTANCE_RADII: f64 = 2.0;
 /// Direction from the model to an outside view: from the front right, 30 degrees above the horizon.
 const VIEW_DIRECTION: [f64; 3] = [0.5, -0.707, 0.5];
 
-/// The point nearest to all optical axes, from the first camera; `None` without keyframes.
+/// The view of the first camera, centered on the point nearest to all optical axes; `None` without keyframes.
 pub fn from_keyframes(keyframes: &[Arc<Keyframe>]) -> Option<SceneHint> {
     from_cameras(keyframes.iter().map(|keyframe| keyframe.world_from_camera).collect())
 }
 
-/// The point nearest to all optical axes, from the first camera; `None` without cameras.
+/// The view of the first camera, centered on the point nearest to all optical axes; `None` without cameras.
 pub fn from_cameras(world_from_cameras: Vec<Transform>) -> Option<SceneHint> {
     let world_from_camera = *world_from_cameras.first()?;
     let center = nearest_to_axes(&world_from_cameras)?;
@@ -50,7 +50,7 @@ pub fn from_bounds(bounds: &Bounds) -> SceneHint {
     }
 }
 
-/// Least squares over the distances to the axes, with a weak pull towards a point ahead of each camera.
+/// The point with the least squared distances to all optical axes, with a weak prior on the distance from each camera.
 fn nearest_to_axes(world_from_cameras: &[Transform]) -> Option<Point3<f64>> {
     let mut normal = Matrix3::zeros();
     let mut right = Vector3::zeros();
@@ -77,7 +77,7 @@ mod tests {
 
     #[test]
     fn cameras_around_an_object_converge_on_it() {
-        /// The prior pulls by about its weight times its error, 0.5 m here.
+        /// The prior shifts the result by about its weight times its error, which is 0.5 m here.
         const TOLERANCE_M: f64 = 0.01;
         let target = Point3::new(0.5, 0.1, 0.05);
         let positions = [[1.5, 0.1, 0.05], [0.5, 1.1, 0.1], [0.4, 0.1, 1.05], [0.5, -0.9, 0.3]];

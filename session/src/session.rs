@@ -1,4 +1,4 @@
-//! A model in training: it takes keyframes, trains, and is evaluated and saved when that is due.
+//! A training session: one model in training, with scheduled evaluations and checkpoints.
 
 mod ending;
 mod outcome;
@@ -47,7 +47,7 @@ pub struct Session {
     scoreboard: Scoreboard,
     persistence: Persistence,
     reporter: Reporter,
-    /// Whether a stop was requested; an evaluation is then aborted.
+    /// A stop request aborts an evaluation in progress.
     stop: Stop,
 }
 
@@ -78,7 +78,7 @@ impl Session {
         self
     }
 
-    /// Aborts an evaluation without a report if a stop is requested.
+    /// Aborts an evaluation, without reporting it, when `stop` is requested.
     pub fn with_stop(self, stop: &Stop) -> Self {
         Self { stop: stop.clone(), ..self }
     }
@@ -122,7 +122,7 @@ impl Session {
         self
     }
 
-    /// Makes this one of several sessions with a common clock.
+    /// Shares a clock with other sessions.
     #[must_use]
     pub fn with_shared_clock(mut self, clock: Clock) -> Self {
         self.time.set_clock(clock);
@@ -139,7 +139,7 @@ impl Session {
         self.time.start(at);
     }
 
-    /// Time at which the clock was started, if it was.
+    /// Time at which the clock was started; `None` if it is not running.
     pub fn clock_started(&self) -> Option<Instant> {
         self.time.started()
     }
@@ -161,7 +161,7 @@ impl Session {
         self.persistence.log_push(self.method.as_mut(), keyframe)
     }
 
-    /// Adds a keyframe that the model was already trained on in the resumed run.
+    /// Adds a keyframe without pushing it to the model, such as one that a resumed model was already trained on.
     pub fn hold(&mut self, keyframe: &Arc<Keyframe>) {
         self.scoreboard.hold(keyframe);
         self.keyframes.push(keyframe.clone());
@@ -189,7 +189,7 @@ impl Session {
         self.method.render(request)
     }
 
-    /// Waits for queued work and returns the total number of updates, including trials.
+    /// Waits for queued work and returns the total number of updates, including those of trials.
     pub fn n_total_steps(&mut self) -> crate::Result<u64> {
         Ok(self.method.n_total_steps()?)
     }
@@ -233,7 +233,7 @@ impl Session {
     /// Trains for one time slice on a shared device, at most `max_steps` steps. Queued work is complete when this
     /// returns.
     ///
-    /// `is_render_pending`: whether a picture waits for the end of the slice; called after each submit.
+    /// `is_render_pending` returns whether a picture is requested, which ends the slice; called after each submit.
     pub fn run_time_slice(
         &mut self,
         max_steps: impl Fn(&Self) -> u64,
@@ -258,12 +258,12 @@ impl Session {
         Ok(())
     }
 
-    /// Time that this session has used a shared device.
+    /// Time for which this session has used a shared device.
     pub fn device_time(&self) -> Duration {
         self.time.device_time()
     }
 
-    /// Raises the device time to at least this, so that an idle session does not catch up later.
+    /// Raises the device time to at least `device_time`, so that an idle session does not catch up later.
     pub fn raise_device_time(&mut self, device_time: Duration) {
         self.time.raise_device_time(device_time);
     }
@@ -290,12 +290,12 @@ impl Session {
         }
     }
 
-    /// What can be continued if the run fails now, as a sentence without a period; `None` if nothing is known.
+    /// Describes how to continue if the run fails now, as a sentence without a period; `None` without recovery.
     pub fn describe_recoverable(&mut self) -> Option<String> {
         self.persistence.describe_recoverable()
     }
 
-    /// Excludes this much from the training time.
+    /// Excludes a duration from the training time.
     pub fn exclude(&self, spent: Duration) {
         self.time.exclude(spent);
     }
@@ -310,12 +310,12 @@ impl Session {
         self.method = Box::new(FailedModel);
     }
 
-    /// Restores the model on another device from the newest checkpoint or, without one, from the start.
+    /// Restores the model on another device from the newest checkpoint or else from scratch.
     pub fn restart_on(&mut self, gpu: &Arc<Gpu>) -> crate::Result<()> {
         self.method = self.persistence.restore(gpu, &self.keyframes)?;
         self.gpu = gpu.clone();
         self.time.unmark_finished();
-        // All images of an evaluation must be scored on the same model state, which is lost.
+        // Drops an evaluation in progress: all of its images must be scored on the same model state, which is lost.
         self.scoreboard.take_pending();
         Ok(())
     }
@@ -380,13 +380,13 @@ impl Session {
         Ok(done)
     }
 
-    /// Sets whether pictures are requested during training; submits are shorter then.
+    /// Sets whether pictures are requested during training. If so, submits are shorter.
     pub fn set_watched(&mut self, watched: bool) {
         self.method.set_watched(watched);
     }
 
-    /// Scores the test keyframe whose score is oldest, for the curve between scheduled evaluations; counts as training
-    /// time.
+    /// Scores the test keyframe with the oldest score, for the PSNR curve between scheduled evaluations. Counts as
+    /// training time.
     pub fn refresh_psnr(&mut self) -> crate::Result<()> {
         let Some(oldest) = self.scoreboard.next_to_refresh() else { return Ok(()) };
         self.persistence.log_render();
@@ -410,7 +410,7 @@ impl Session {
         self.reporter.evaluations()
     }
 
-    /// The result of keyframe alignment, once it is decided.
+    /// The result of keyframe alignment, once it is available.
     pub fn alignment(&self) -> Option<&Alignment> {
         self.method.alignment()
     }

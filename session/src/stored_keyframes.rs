@@ -29,7 +29,7 @@ pub struct StoredKeyframes {
     folder: PathBuf,
 }
 
-/// All of a keyframe except its pixels.
+/// A keyframe without its pixels.
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Description {
@@ -65,7 +65,7 @@ struct BaseDescription {
 }
 
 impl StoredKeyframes {
-    /// The stored keyframes of the run in this folder; nothing is read or written yet.
+    /// The stored keyframes of the run in this folder. Does not access the disk.
     pub fn of_run(run: &Path) -> Self {
         Self { folder: run.join(FOLDER) }
     }
@@ -204,8 +204,8 @@ fn keyframe_of(checkpoint: &Checkpoint) -> crate::Result<Keyframe> {
     })
 }
 
-/// Encodes four bytes per pixel without loss. Depth is stored the same way: the bytes of an f32 differ little between
-/// neighbors.
+/// Losslessly encodes four bytes per pixel. For depth, these are the bytes of an f32, which compress well because
+/// neighboring pixels are similar.
 fn png([width, height]: [u32; 2], bytes: &[u8]) -> crate::Result<Vec<u8>> {
     let mut png = Vec::new();
     let encoder = PngEncoder::new_with_quality(&mut png, CompressionType::Fast, FilterType::Sub);
@@ -213,7 +213,7 @@ fn png([width, height]: [u32; 2], bytes: &[u8]) -> crate::Result<Vec<u8>> {
     Ok(png)
 }
 
-/// Three numbers of the translation, then the quaternion with its real part last.
+/// The translation, then the quaternion with its real part last.
 fn numbers(pose: &Transform) -> [f64; 7] {
     let [x, y, z] = pose.translation.vector.into();
     let [i, j, k, w] = pose.rotation.coords.into();

@@ -1,16 +1,15 @@
 //! Time slices for several models on one device.
 //!
-//! The next slice goes to the model with the least device time so far. Results do not depend on the slices: a model is
-//! a function of its steps and keyframes alone.
+//! The next slice goes to the model with the least device time so far. Slices do not affect results, which depend only
+//! on the steps and keyframes of a model.
 
 use crate::session::Session;
 use std::time::Duration;
 
-/// Trains the model that has used the device least, among those that can train, and then evaluates all sessions that
-/// are due.
+/// Trains the session with the least device time among those that can train, then runs all evaluations that are due.
 ///
-/// `max_steps`: maximum number of steps of a session in this slice, given its index. `is_render_pending`: whether a
-/// picture waits; the slice then ends after the current submit.
+/// `max_steps` returns the maximum number of steps of a session, given its index. `is_render_pending` returns whether a
+/// picture is requested; the slice then ends after the current submit.
 pub(crate) fn train_next(
     sessions: &mut [Session],
     max_steps: impl Fn(usize, &Session) -> u64,
@@ -27,7 +26,7 @@ pub(crate) fn train_next(
         if sessions.len() == 1 {
             sessions[ix].train_steps(max_steps(ix, &sessions[ix]))?;
         } else {
-            // A session that had nothing to train on for a while does not catch up.
+            // A session that was idle for a while does not catch up.
             sessions.iter_mut().for_each(|session| session.raise_device_time(min_time));
             sessions[ix].run_time_slice(|session| max_steps(ix, session), is_render_pending)?;
         }
@@ -35,8 +34,8 @@ pub(crate) fn train_next(
     sessions.iter_mut().try_for_each(Session::evaluate_when_due)
 }
 
-/// Index and device time of the session with the least device time, the first of several; `None` if no session can
-/// train.
+/// Index and device time of the session with the least device time (the first one if several have the same); `None` if
+/// no session can train.
 fn next(device_time: &[Option<Duration>]) -> Option<(usize, Duration)> {
     device_time
         .iter()

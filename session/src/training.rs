@@ -1,4 +1,4 @@
-//! Trains models from keyframes on disk: once in `train`, many times in `bench`.
+//! Trains models on keyframes from disk, for `train` and `bench`.
 
 use crate::data::{Data, DataOptions};
 use crate::methods::{self, COUNT, MAX_SPLATS, Settings, methods_of};
@@ -17,7 +17,7 @@ use trainer::gpu::Gpu;
 use trainer::splat::CountPolicy;
 use trainer::{self, CommonOptions, ModelKind, ModelSpec};
 
-/// Everything that determines a training besides its keyframes.
+/// All inputs of a training run except its keyframes.
 pub struct TrainingPlan {
     /// Method and options of the model.
     pub model_spec: ModelSpec,
@@ -25,13 +25,13 @@ pub struct TrainingPlan {
     pub evaluators: Evaluators,
     /// When to stop.
     pub limits: Limits,
-    /// Receives the reports.
+    /// Receives the events.
     pub observer: Box<dyn Observer>,
 }
 
 /// Trains a new model until a limit or until `stop` is requested.
 ///
-/// The clock starts once all pipelines are compiled; seeding counts.
+/// The clock starts once all pipelines are compiled. Seeding counts as training time.
 pub fn train(
     gpu: Arc<Gpu>,
     plan: TrainingPlan,
@@ -50,7 +50,7 @@ pub fn train(
 
 /// Starts the clock, pushes the keyframes to all models, and trains each until a limit or until `stop` is requested.
 ///
-/// `preparation_time`: time already spent on preparing the keyframes, which counts as training time.
+/// `preparation_time`: time already spent on preparing the keyframes; it counts as training time.
 pub fn drive(
     sessions: &mut [Session],
     keyframes: &[Arc<Keyframe>],
@@ -70,7 +70,7 @@ pub fn drive(
                 ModelKind::ALL.iter().filter(|kind| !kind.entry().needs_depth).map(|kind| kind.name()).collect();
             return Err(Error::InsufficientData(format!(
                 "the method {} needs depth, but no training image has depth: \
-                 use --depth-from to render it from another model of the scene, or the method {}",
+                 use --depth-from to render depth from another model of the scene, or use the method {}",
                 session.kind().name(),
                 listed(&others, "or")
             )));
@@ -92,8 +92,8 @@ pub fn drive(
     }
 }
 
-/// The methods and their options. For a recording, its rig file sets them and flags override it; for a folder, only
-/// flags set them.
+/// The methods and their options. For a recording, they come from its rig file with flags applied; for a folder, from
+/// flags only.
 pub fn model_specs(
     options: &TrainingOptions,
     data: &Data,
@@ -103,13 +103,13 @@ pub fn model_specs(
     let rig_methods = data.rig.as_ref().map(methods_of).transpose()?;
     let kinds = rig_methods.or(options.methods.clone()).unwrap_or_else(|| vec![ModelKind::default()]);
     options.check_for(&kinds)?;
-    // A trial takes hundreds of additional steps, which take minutes on a CPU.
     let available = AvailableData {
         joints: data.rig.is_some(),
         drifts: data.rig.as_ref().is_none_or(Rig::has_moving_base),
         // Depth rendered from reported camera poses contains no information about the true poses.
         depth: data.has_depth() && data.rendered_depth.as_ref().is_none_or(|rendered| rendered.n_images == 0),
     };
+    // On a CPU, no trials by default: each takes hundreds of additional steps, which take minutes.
     let RefineSettings { align, with_scene: cameras } =
         options.refining(available, if software { Refine::None } else { Refine::Auto })?;
     options.check_learned(&kinds, available)?;
@@ -134,14 +134,14 @@ fn options_without_rig(options: &TrainingOptions, steps: Option<u64>) -> (Common
     (common, options.max_splats.map(|n| (MAX_SPLATS, n.into())).into_iter().collect())
 }
 
-/// Checks flags that do not depend on the contents of the data, before all data are read.
+/// Checks the flags that do not depend on the contents of the data, so that errors appear before all data are read.
 pub fn check_before_data(options: &TrainingOptions, path: &Path, images: &DataOptions) -> crate::Result<()> {
     let defaults = || Data::default_methods(path, images);
     let kinds = options.methods.clone().map_or_else(defaults, Ok)?;
     options.check_before_data(&kinds, run_folder::is_recording(path))
 }
 
-/// When to stop, from `--seconds` and `--steps`; `default_secs` if neither is given.
+/// The limits given by `--seconds` and `--steps`, or `default_secs` if neither is given.
 pub fn limits(seconds: Option<f64>, steps: Option<u64>, default_secs: f64) -> Result<Limits, Error> {
     if seconds.is_some_and(|seconds| seconds.is_nan() || seconds < 0.0) {
         return Err(Error::BadInput("--seconds: must be a number of at least 0".into()));

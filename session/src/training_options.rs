@@ -1,4 +1,4 @@
-//! Options shared by everything that trains. They override the keys of the same name in a rig file.
+//! Options shared by all commands that train. They override the keys of the same name in a rig file.
 
 use crate::Error;
 use crate::methods::{COUNT, MAX_SPLATS, describe};
@@ -11,7 +11,7 @@ use trainer::splat::CountPolicy;
 /// The rig file key that `--refine` sets.
 pub const REALIGN: &str = "base.realign";
 
-/// Which models to train, and their limits; `None` leaves the choice to the rig file or the default.
+/// Which models to train, and their limits. `None` means the value of the rig file or the default.
 #[derive(Clone, Debug, Default)]
 pub struct TrainingOptions {
     /// Scene models, without duplicates.
@@ -22,20 +22,20 @@ pub struct TrainingOptions {
     pub max_bytes: Option<u64>,
     /// Maximum number of splats.
     pub max_splats: Option<u64>,
-    /// Calibration parameters to estimate; empty: the default.
+    /// Calibration parameters to estimate; the default if empty.
     pub refine: Vec<Refine>,
     /// How the number of splats is chosen.
     pub count: Option<CountPolicy>,
 }
 
-/// Calibration parameters that can be requested, and how to choose them.
+/// Values of `--refine`: calibration parameters, and ways to choose them.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Refine {
-    /// Those that improve validation images.
+    /// All parameters that improve the scores of validation images.
     Auto,
     /// No parameters.
     None,
-    /// The rig file's `base.realign`; not a camera parameter.
+    /// Pose of a mobile base at each station (`base.realign` in the rig file); not a camera parameter.
     Base,
     /// Pose of each camera relative to its parent.
     Extrinsics,
@@ -47,7 +47,7 @@ pub enum Refine {
     DepthPose,
     /// Focal length and principal point of each camera.
     Lens,
-    /// Factor on the readings of each depth camera.
+    /// Scale factor of each depth camera's readings.
     DepthScale,
     /// Time from the first to the last row of each rolling shutter.
     Readout,
@@ -93,15 +93,16 @@ pub struct RefineSettings {
 /// Properties of the data that limit which calibration parameters can be estimated.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct AvailableData {
-    /// Poses come from the joints of a recording, so their errors are systematic and shared by all images.
+    /// Whether poses come from the joints of a recording, so that their errors are systematic and shared by all images.
     pub joints: bool,
-    /// Poses come from a SLAM system or a base that uses one, so they drift from image to image.
+    /// Whether poses come from a SLAM system or a base that uses one, so that they drift from image to image.
     pub drifts: bool,
-    /// Keyframes have depth.
+    /// Whether keyframes have depth.
     pub depth: bool,
 }
 
-/// Numbers of keyframes at which a live run registers them: at the first, about four are validation images.
+/// Numbers of keyframes at which a live run registers its keyframes. At the first number, about four of them are
+/// validation images.
 pub const LIVE_ALIGNMENT_KEYFRAMES: [usize; 4] = [32, 64, 128, 256];
 
 impl TrainingOptions {
@@ -110,7 +111,7 @@ impl TrainingOptions {
         self.methods.as_deref()
     }
 
-    /// Rejects flags that set an option which none of the methods has.
+    /// Rejects flags for options that none of the methods has.
     pub fn check_for(&self, kinds: &[ModelKind]) -> Result<(), Error> {
         let flags = [(self.max_splats.is_some(), "--max-splats", MAX_SPLATS), (self.count.is_some(), "--count", COUNT)];
         let is_unused = |option: &str| !kinds.iter().any(|kind| kind.has_option(option));
@@ -135,7 +136,7 @@ impl TrainingOptions {
         self.check_learned(kinds, all_available)
     }
 
-    /// Rejects requested parameters that no scene model can estimate; the error lists the valid ones.
+    /// Rejects requested parameters that no scene model can estimate. The error lists the supported parameters.
     pub fn check_learned(&self, kinds: &[ModelKind], available: AvailableData) -> Result<(), Error> {
         let can_align = |param: &Refine| available.depth && *param != Refine::ImageGains;
         let can_learn = |param: &Refine| {
@@ -146,7 +147,7 @@ impl TrainingOptions {
         let is_known = |param: &Refine| is_other(param) || can_align(param) || can_learn(param);
         let Some(unknown) = self.refine.iter().find(|param| !is_known(param)) else { return Ok(()) };
         let known: Vec<&str> = Refine::ALL.iter().filter(|(_, param)| is_known(param)).map(|(name, _)| *name).collect();
-        let without = if available.depth { "" } else { " without depth at the start" };
+        let without = if available.depth { "" } else { " without measured depth" };
         Err(Error::BadInput(format!(
             "--refine {}: the method {} cannot estimate this{without}; it supports {}",
             unknown.name(),
@@ -167,7 +168,7 @@ impl TrainingOptions {
         }
         let needs_depth = [Refine::Joints, Refine::DepthPose, Refine::DepthScale, Refine::Readout];
         if let (Some(param), false) = (needs_depth.into_iter().find(|param| has(*param)), available.depth) {
-            let message = "needs depth images that are all available before training";
+            let message = "needs depth images measured by a camera";
             return Err(Error::BadInput(format!("--refine {}: {message}", param.name())));
         }
         if has(Refine::Joints) && !available.joints {
@@ -186,8 +187,8 @@ impl TrainingOptions {
         })
     }
 
-    /// Which calibration parameters a live run estimates. Without the flag, those that registration can estimate; on a
-    /// software adapter none, because training is slow already.
+    /// Which calibration parameters a live run estimates. Without the flag, these are all that registration can
+    /// estimate, or none on a software adapter, where training is already slow.
     pub fn refining_live(&self, available: AvailableData, software: bool) -> Result<RefineSettings, Error> {
         if !self.refine.is_empty() || software {
             return self.refining(available, Refine::None);
@@ -221,7 +222,7 @@ impl TrainingOptions {
     }
 }
 
-/// The value of `train.method`: a word, or a list of words if there are several.
+/// The value of `train.method`: a string, or a list of strings for several methods.
 fn method_names(kinds: &[ModelKind]) -> toml::Value {
     match kinds {
         [one] => one.name().into(),
@@ -247,7 +248,8 @@ fn param_set(requested: &[Refine]) -> ParamSet {
 }
 
 impl AvailableData {
-    /// The candidates to try, most promising first: by registration where possible, otherwise jointly with the scene.
+    /// Candidates for trials, the most promising first. They are estimated by registration if there is depth, otherwise
+    /// jointly with the scene.
     fn auto_settings(self) -> RefineSettings {
         let gains = ParamSet::IMAGE_GAINS;
         let poses = ParamSet::IMAGE_POSES;
@@ -310,7 +312,7 @@ mod tests {
     }
 
     #[test]
-    fn flags_of_splats_need_splats() {
+    fn unsupported_flags_are_rejected_for_each_method() {
         let options =
             TrainingOptions { max_splats: Some(5), refine: vec![Refine::ImageGains], ..TrainingOptions::default() };
         let available = AvailableData { joints: true, drifts: false, depth: true };

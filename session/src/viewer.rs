@@ -1,4 +1,4 @@
-//! Draws models that no longer change for the page: the loop of `view`, and of a run that has ended.
+//! Draws trained models for viewers: the loop of `view`, and of a run after its training.
 
 use capture::Stop;
 use kinematics::Transform;
@@ -6,7 +6,7 @@ use std::time::Duration;
 use trainer::{Aabb, Method, ModelKind, RenderRequest};
 use viz::{Hub, PendingRender};
 
-/// Longest time until Ctrl-C is noticed while no client requests a picture.
+/// Maximum response time to Ctrl-C while no client requests a picture.
 const POLL_PERIOD: Duration = Duration::from_millis(100);
 
 /// A model that clients can view.
@@ -17,12 +17,12 @@ pub struct ServedModel {
     pub method: Box<dyn Method>,
 }
 
-/// Models that no longer change, and the hub of clients that view them.
+/// Trained models and the hub of the clients that view them.
 pub struct ModelViewer {
-    /// The first is drawn for clients that name no method.
+    /// The first model is drawn for requests that name no method.
     models: Vec<ServedModel>,
     hub: Hub,
-    /// The page is z up; a model may not be.
+    /// Pose of the page's world, which is z up, in the model's world.
     model_from_page: Transform,
 }
 
@@ -56,7 +56,7 @@ impl ModelViewer {
         let Some(model) = self.models.iter_mut().find(is_requested) else {
             let names: Vec<&str> = self.models.iter().map(|model| model.kind.name()).collect();
             let requested_method = requested_method.unwrap_or_default();
-            return pending.fail(&format!("no model with the method {requested_method:?}, only {}", names.join(", ")));
+            return pending.fail(&format!("no model with the method {requested_method:?}; use {}", names.join(" or ")));
         };
         match model.method.render(&request) {
             Ok(picture) => pending.deliver(picture),
@@ -65,7 +65,7 @@ impl ModelViewer {
     }
 }
 
-/// The page's request in the model's world frame.
+/// Transforms a request from the page's world frame to the model's world frame.
 fn in_model(request: &RenderRequest, model_from_page: &Transform) -> RenderRequest {
     let crop = request.crop.map(|crop| Aabb { world_from_box: model_from_page * crop.world_from_box, ..crop });
     RenderRequest { world_from_camera: model_from_page * request.world_from_camera, crop, ..request.clone() }

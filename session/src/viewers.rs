@@ -3,7 +3,7 @@
 use capture::{ImageObserver, ObservedImage, ObservedPixels};
 use viz::{Hub, LiveImage, LivePixels};
 
-/// The viewers of a run, as an observer of its input.
+/// An observer of a run's input that passes images to the clients of a hub.
 pub struct Viewers(pub Hub);
 
 impl ImageObserver for Viewers {

@@ -96,7 +96,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     Ok(())
 }
 
-/// Cameras ahead and behind, and a scanner.
+/// Front and rear cameras, and a scanner.
 fn mobile_base(config: &mut Config) {
     config.scene = sim::Scene::MobileBase;
     (config.joint_names, config.reading_order) = (Vec::new(), Vec::new());

@@ -34,7 +34,7 @@ pub(crate) struct Arm {
 }
 
 impl Arm {
-    /// Places the arm at the scan's start, at rest. Readings are kept for `history_duration_nanos`.
+    /// Places the arm at rest at the start of the scan. Readings are kept for `history_duration_nanos`.
     pub(crate) fn new(model: Arc<MjModel>, follower: Follower, history_duration_nanos: i64) -> Result<Self, Error> {
         let mut data = MjData::new(model);
         if data.qpos().len() != N_JOINTS {
@@ -62,7 +62,7 @@ impl Arm {
         reading
     }
 
-    /// Spring and damper torques around the scan's joint positions, added to gravity compensation.
+    /// Gravity compensation, plus spring and damper torques toward the joint positions of the scan.
     fn control(&self, position_rad: &Joints, velocity_rad_s: &Joints) -> Joints {
         let position_error = self.follower.position_rad() - position_rad;
         let velocity_error = self.follower.velocity_rad_s() - velocity_rad_s;
@@ -76,8 +76,8 @@ impl Arm {
         })
     }
 
-    /// Joint positions at a time covered by the kept readings: cubic interpolation from both neighbors and their
-    /// velocities.
+    /// Joint positions at a time, by cubic interpolation of the two neighboring readings; `None` if no readings cover
+    /// it.
     pub(crate) fn position_at(&self, nanos: i64) -> Option<Joints> {
         let first = self.readings.front()?;
         let ix = usize::try_from((nanos - first.nanos).checked_div(STEP_NANOS)?).ok()?;

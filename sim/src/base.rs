@@ -6,14 +6,14 @@ use kinematics::Transform;
 use nalgebra::{Translation3, UnitQuaternion, Vector3};
 use std::f64::consts::TAU;
 
-/// Motion of the base in closed form; can be evaluated at any time.
+/// Closed-form motion of the base, which can be evaluated at any time.
 #[derive(Clone, Copy, Debug)]
 pub(crate) enum BaseMotion {
     /// The base is at the world's origin.
     Fixed,
-    /// A quadruped walks sideways around the origin, facing mostly inward. The value is a factor on its speed.
+    /// A quadruped walks sideways around the origin, facing mostly inward. The value scales its speed.
     Lap(f64),
-    /// A station at a distance, then a second one close by. The value is a factor on the speed.
+    /// The base stands at a far station, then walks to a near one. The value scales its speed.
     Stations(f64),
 }
 
@@ -60,8 +60,7 @@ impl BaseMotion {
         }
     }
 
-    /// Fraction of the whole walk (one lap, or from the first station to the last) that has been completed; exceeds 1
-    /// after it.
+    /// Completed fraction of the walk (one lap, or from the first station to the last); above 1 in later laps.
     pub(crate) fn walked_frac(&self, secs: f64) -> f64 {
         match self {
             Self::Fixed => 0.0,
@@ -94,8 +93,8 @@ impl BaseMotion {
         }
     }
 
-    /// Seconds since the base became stationary and the index of its station, or `None` while it moves. The arm scans
-    /// only at stations.
+    /// Index of the current station and seconds since arrival (at speed 1), or `None` while the base moves. The arm
+    /// scans only at stations.
     pub(crate) fn station_at(&self, secs: f64) -> Option<(usize, f64)> {
         match self {
             Self::Fixed => Some((0, secs)),
@@ -112,28 +111,28 @@ impl BaseMotion {
     }
 }
 
-/// Progress along the laps in seconds at constant speed: starts at rest, then speeds up and slows down by a third.
+/// Progress along the laps, in seconds at nominal speed. The walk starts at rest; then its speed varies by a third.
 fn lap_secs(secs: f64, speed: f64) -> f64 {
     const START_SECS: f64 = 1.5;
     const OSCILLATION: (f64, f64) = (0.35, 7.3);
     let at = secs * speed;
     let ramp = (at / START_SECS).clamp(0.0, 1.0);
     let started = START_SECS * (ramp.powi(3) - 0.5 * ramp.powi(4)) + (at - START_SECS).max(0.0);
-    // Its derivative starts at zero too, so the first step is smooth.
+    // The oscillation starts with zero derivative, so the walk starts smoothly.
     started + OSCILLATION.0 * OSCILLATION.1 / TAU * (1.0 - (started * TAU / OSCILLATION.1).cos())
 }
 
 fn lap_pose(at: f64, gait_secs: f64) -> Transform {
     let around = at / LAP_SECS * TAU + std::f64::consts::PI;
     let radius_m = oscillate([2.25, 0.38, 23.0, 0.1], at);
-    // From looking at the pedestal to looking past it.
+    // The heading varies between facing the pedestal and facing past it.
     let heading_offset_rad = oscillate([0.25, 0.55, 15.7, 0.0], at);
     let position =
         [radius_m * around.cos(), radius_m * around.sin(), around + std::f64::consts::PI + heading_offset_rad];
     gait(gait_secs, smooth(at / 2.0), position)
 }
 
-/// The body on its legs at a position and heading, bouncing and swaying.
+/// Pose of the walking body at a position and heading, with bounce and sway.
 fn gait(secs: f64, gait_amplitude: f64, [x, y, yaw]: [f64; 3]) -> Transform {
     let step = secs * GAIT_HZ * TAU;
     let bounce_m = BOUNCE_M * gait_amplitude * (2.0 * step).sin();
@@ -143,7 +142,7 @@ fn gait(secs: f64, gait_amplitude: f64, [x, y, yaw]: [f64; 3]) -> Transform {
     Transform::from_parts(Translation3::new(x, y, BODY_Z_M + bounce_m), rotation_vector)
 }
 
-/// Error of a SLAM system: a random walk that advances while the base walks.
+/// Drift like that of a SLAM system: a random walk that advances only while the base walks.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Drift {
     random: RandomStream,
@@ -154,7 +153,7 @@ pub(crate) struct Drift {
 
 /// Steps of the random walk over the whole walk.
 const N_STEPS: f64 = 64.0;
-/// Gravity and the floor constrain height, roll and pitch: their errors relative to those of the other axes.
+/// Errors of height, roll and pitch relative to the other axes: gravity and the floor constrain them.
 const CONSTRAINED_AXIS_FRAC: f64 = 0.3;
 /// Identifies the random number stream.
 const DRIFT: u64 = 0xd41f;
@@ -173,12 +172,12 @@ impl Drift {
         }
     }
 
-    /// The reported pose for a true pose after a fraction of the walk.
+    /// Reported pose, given the true pose and the completed fraction of the walk.
     pub(crate) fn reported(&self, world_from_base: &Transform, walked_frac: f64) -> Transform {
         let steps = walked_frac * N_STEPS;
         let (mut translation_error, mut rotation_vector) = (Vector3::zeros(), Vector3::zeros());
         let mut step = 0_u64;
-        // Sums from the start: a few hundred steps even in a long run, and no state that could become inconsistent.
+        // Summing all steps each time needs no state, and even a long run has only a few hundred steps.
         while (step as f64) < steps {
             let share = smooth(steps - step as f64);
             let [a, b] = [2 * step, 2 * step + 1].map(|counter| self.random.normals(counter).map(f64::from));

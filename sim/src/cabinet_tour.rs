@@ -1,4 +1,4 @@
-//! The camera tour of the mobile arm: the cabinet from two stations, then into it.
+//! The camera tour of the mobile arm: it views the cabinet from two stations, then enters it.
 
 use crate::base::{BaseMotion, base_from_arm, oscillate, smooth};
 use crate::cabinet::{CENTER_Z_M, FRONT_X_M, SCREEN_M};
@@ -12,7 +12,7 @@ pub(crate) struct CabinetTour {
     motion: BaseMotion,
     /// Poses of the base at both stations.
     world_from_station: [Transform; 2],
-    /// Time at which the base leaves the first station and reaches the second, seconds.
+    /// Times at which the base leaves the first station and reaches the second, seconds.
     walk_secs: [f64; 2],
     speed: f64,
 }
@@ -20,7 +20,7 @@ pub(crate) struct CabinetTour {
 /// Seconds at the second station before the camera enters, and duration of one trip in and out.
 const OUTSIDE_SECS: f64 = 9.0;
 const IN_AND_OUT_SECS: f64 = 22.0;
-/// The lamps change over this range of distances before and behind the opening, meters.
+/// The lamps change while the camera moves between these depths behind the opening, meters; negative is outside.
 const LIGHT_TRANSITION_M: [f64; 2] = [-0.20, 0.02];
 
 impl CabinetTour {
@@ -36,7 +36,8 @@ impl CabinetTour {
         match self.motion.station_at(secs) {
             Some((station, at)) => self.at_station(station, at),
             None => {
-                // The last pose at the first station blends into the first at the second while the base walks.
+                // While the base walks, the camera moves from its last pose at the first station to its first pose at
+                // the second.
                 let share = smooth((secs - departure_secs) / (arrival_secs - departure_secs));
                 transform::interpolate(
                     &self.at_station(0, departure_secs * self.speed),

@@ -18,7 +18,7 @@ pub struct Config {
     pub truth: bool,
     /// Whether the ground truth of cameras with depth includes noise-free depth.
     pub truth_depth: bool,
-    /// Factor on the speed of the scanning motion, above 0 to 2; at 1 the camera moves at 0.1 to 0.25 m/s.
+    /// Factor on the speed of the scanning motion, 0.01 to 2; at 1 the camera moves at 0.1 to 0.25 m/s.
     pub speed: f64,
     /// Whether the camera only rotates about the vertical axis. Such a scan does not determine the whole hand-eye
     /// transform.
@@ -29,7 +29,7 @@ pub struct Config {
     pub n_images: Option<u64>,
     /// Names of the arm's joints from base to flange.
     pub joint_names: Vec<String>,
-    /// The same names, in the order of the joint readings.
+    /// Joint names in the order of the joint readings.
     pub reading_order: Vec<String>,
     /// The cameras; names are unique.
     pub cameras: Vec<CameraConfig>,
@@ -49,7 +49,7 @@ pub struct BaseConfig {
     /// Root mean square error of the reported position at the end of the walk (one lap, or the last station), meters.
     /// The error grows with the square root of the distance.
     pub drift_m: f64,
-    /// Root mean square error of the reported orientation there, radians.
+    /// Root mean square error of the reported orientation at the end of the walk, radians.
     pub drift_rad: f64,
 }
 
@@ -105,7 +105,7 @@ impl ScannerConfig {
 /// The available scenes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Scene {
-    /// A Panda on a table between two walls; a furry toy, a tag cube and a wooden block.
+    /// A Panda on a table between two walls, with a furry toy, a tag cube and a wooden block.
     StaticArm,
     /// A quadruped walks around a wooden pedestal with a glass bowl in a laboratory of 15 x 10 m.
     MobileBase,

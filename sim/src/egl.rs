@@ -23,9 +23,9 @@ pub(crate) struct HeadlessContext {
 impl HeadlessContext {
     /// Opens the first platform that works: a hardware device, Mesa's surfaceless platform, a software device.
     ///
-    /// On machines with a GPU, Mesa's surfaceless platform may render in software, so devices come first.
+    /// On machines with a GPU, Mesa's surfaceless platform may render in software, so hardware devices come first.
     pub(crate) fn open() -> Result<Self, Error> {
-        // SAFETY: loading libEGL runs its initializers, which are those of the system's own library.
+        // SAFETY: loading libEGL runs its initializers, and the system's library is trusted.
         let egl = unsafe { Egl::load_required() }.map_err(|error| Error::NoEgl { reason: error.to_string() })?;
         let devices = devices(&egl);
         let hardware = devices.iter().filter(|device| !device.is_software);
@@ -75,7 +75,7 @@ fn devices(egl: &Egl) -> Vec<Device> {
     else {
         return Vec::new();
     };
-    // SAFETY: EGL_EXT_device_enumeration and EGL_EXT_device_query give these functions these signatures.
+    // SAFETY: the signatures are those of EGL_EXT_device_enumeration and EGL_EXT_device_query.
     let (query, query_string) = unsafe {
         (
             std::mem::transmute::<extern "system" fn(), QueryDevices>(query),
@@ -106,7 +106,7 @@ fn make_current(
     platform: egl::Enum,
     native: egl::NativeDisplayType,
 ) -> Result<(egl::Display, egl::Context), egl::Error> {
-    // SAFETY: the native display is null for the surfaceless platform, else a device listed by EGL.
+    // SAFETY: the native display is null for the surfaceless platform, and a device listed by EGL otherwise.
     let display = unsafe { egl.get_platform_display(platform, native, &[egl::ATTRIB_NONE]) }?;
     egl.initialize(display)?;
     let attributes = [
@@ -135,7 +135,7 @@ fn renderer_name(egl: &Egl) -> String {
     let Some(get_string) = egl.get_proc_address("glGetString") else {
         return "an unnamed renderer".to_owned();
     };
-    // SAFETY: OpenGL gives glGetString this signature.
+    // SAFETY: this is the signature of glGetString in OpenGL.
     let get_string = unsafe { std::mem::transmute::<extern "system" fn(), GetString>(get_string) };
     let name = get_string(RENDERER);
     if name.is_null() {

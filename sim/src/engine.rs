@@ -36,7 +36,7 @@ pub(crate) struct Engine {
     renderer: Renderer,
     /// Stamp of simulated time zero.
     start: Stamp,
-    /// Maximum number of images being rendered before the engine waits for the first.
+    /// Maximum number of images being rendered; the engine waits for the oldest before it submits more.
     max_pending: usize,
     /// Images that would arrive before this simulated time are skipped. Set by the real-time loop when it is late.
     skip_before_nanos: i64,
@@ -77,7 +77,7 @@ struct Exposure {
     arrival_nanos: i64,
     n_skipped: u64,
     world_from_camera: Transform,
-    /// Camera poses at other instants relative to `world_from_camera`, if the shutter requires them.
+    /// Camera poses at the exposure instants of the rows, relative to `world_from_camera`; empty if all are the same.
     row_motions: Vec<RowMotion>,
     picture: Pending,
     depth_picture: Option<Pending>,
@@ -136,13 +136,13 @@ impl Camera {
         nanos_from_secs(0.5e-6 * (self.sensor.readout_micros + self.sensor.exposure_micros))
     }
 
-    /// Time from the stamp to the arrival; never before the joint readings cover the last row.
+    /// Time from the stamp to the arrival. It is long enough for the joint readings to cover the last row.
     fn delivery_delay_nanos(&self) -> i64 {
         self.half_span_nanos() + STEP_NANOS + nanos_from_secs(1e-3 * self.sensor.latency_millis)
     }
 
-    /// Instants at which the rows are exposed, relative to the stamp: those of the first row, then of the second.
-    /// Empty if all are zero.
+    /// Exposure instants relative to the stamp: all instants of the first row, then of the second, and so on. Empty if
+    /// the camera is stationary or exposes all rows at the stamp.
     fn row_offsets_nanos(&self) -> Vec<i64> {
         let sensor = &self.sensor;
         if self.config.parent == Parent::World || (sensor.readout_micros <= 0.0 && sensor.blur_samples <= 1) {
@@ -355,7 +355,7 @@ impl Engine {
             let world_from_row = camera.world_from_camera(&robot_at(stamp_nanos + offset)?);
             row_motions.push(RowMotion::new(&(camera_from_world * world_from_row)));
         }
-        // A camera on the robot does not see the robot. Omitting it also keeps its shadow off the scene.
+        // Images of cameras on the robot omit the robot and its shadow.
         let robot = (camera.config.parent == Parent::World).then_some(robot);
         let light_frac = match self.config.scene {
             Scene::MobileArm if !self.config.ideal && camera.config.parent == Parent::Flange => {
@@ -387,7 +387,7 @@ impl Engine {
         Ok(())
     }
 
-    /// Waits for the rendered image and converts it to what the camera delivers.
+    /// Waits for the rendered image and converts it to the image that the camera delivers.
     fn finish_image(&mut self, exposure: Exposure) -> Result<(), Error> {
         let camera = &self.cameras[exposure.camera_ix];
         let picture = exposure.picture.wait()?;

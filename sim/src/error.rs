@@ -19,7 +19,7 @@ pub enum Error {
         upper: f64,
     },
     /// The configuration names a different number of joints than the arm has.
-    #[error("the simulated arm has {expected} joints, {got} names were given")]
+    #[error("the simulated arm has {expected} joints, but {got} names were given")]
     NJoints {
         /// Number of names given.
         got: usize,
@@ -50,13 +50,13 @@ pub enum Error {
         camera: String,
     },
     /// MuJoCo rejected the generated scene.
-    #[error("mujoco rejected the scene: {reason}")]
+    #[error("MuJoCo rejected the scene: {reason}")]
     Scene {
         /// Message from MuJoCo.
         reason: String,
     },
     /// MuJoCo could not cast rays.
-    #[error("mujoco could not cast rays: {reason}")]
+    #[error("MuJoCo could not cast rays: {reason}")]
     Rays {
         /// Message from MuJoCo.
         reason: String,
@@ -105,7 +105,7 @@ pub enum Error {
     #[error("cannot start a thread")]
     Thread(#[source] std::io::Error),
     /// The scan requires a pose that the arm cannot reach.
-    #[error("the arm cannot look at the scene from the scan's position at {at_secs:.1} s")]
+    #[error("the arm cannot reach the camera pose of the scan at {at_secs:.1} s")]
     Unreachable {
         /// Time in the scan, seconds.
         at_secs: f64,

@@ -13,7 +13,7 @@ use nalgebra::{Matrix6, SMatrix, Vector6};
 pub(crate) enum Tour {
     /// Around the target area on the table.
     Table(Scan),
-    /// From two stations, and into the cabinet.
+    /// Around the cabinet from two stations, and into it.
     Cabinet(CabinetTour),
 }
 
@@ -80,8 +80,8 @@ impl Follower {
         Ok(follower)
     }
 
-    /// Simulates half a minute of the scan without dynamics. With some camera extrinsics, the arm reaches its limits
-    /// and the camera looks away.
+    /// Follows half a minute of the scan without dynamics, and warns if the camera leaves the tour. With some camera
+    /// extrinsics, this happens because the arm reaches its joint limits.
     fn warn_if_tour_is_unreachable(mut self) {
         const CHECKED_SECS: f64 = 30.0;
         const STEP_SECS: f64 = 0.005;
@@ -131,7 +131,7 @@ impl Follower {
         self.position_rad = clamp_to_limits(self.position_rad + self.velocity_rad_s * step_secs);
     }
 
-    /// Minimum and maximum joint velocity; decreases toward a limit.
+    /// Minimum and maximum velocity of a joint. Close to a position limit, the velocity toward it is reduced.
     fn allowed_speed_rad_s(&self, ix: usize) -> [f64; 2] {
         let (position, fastest) = (self.position_rad[ix], SPEED_LIMIT_FRAC * panda::MAX_SPEED_RAD_S[ix]);
         let to_lower = position - panda::LOWER_RAD[ix] - LIMIT_MARGIN_RAD;
@@ -140,7 +140,7 @@ impl Follower {
         [-towards(to_lower), towards(to_upper)]
     }
 
-    /// Joint velocity that moves the camera to the target pose; the remaining freedom moves the joints to the
+    /// Joint velocity that moves the camera toward the target pose. Null-space motion moves the joints toward the
     /// preferred posture.
     fn desired_velocity(&self, target_pose: &Transform, target_twist: &Vector6<f64>) -> Joints {
         let (base_from_camera, jacobian) = panda::jacobian(&self.position_rad, &self.flange_from_camera);

@@ -1,4 +1,4 @@
-//! Assembles boxes into benches, shelves and clutter, and records them for the shadows they cast.
+//! Assembles boxes into benches, shelves and clutter, and keeps the boxes for computing shadows.
 
 use crate::lab_texture::picture;
 use crate::light::Occluders;
@@ -55,7 +55,7 @@ impl Furniture {
         among[usize::try_from(self.random.bits(self.n_drawn) % n).expect("below the number of pictures")]
     }
 
-    /// A box that shows one texture on its front (+x), back and sides, and another on its top.
+    /// A box with one texture on its front (+x), back and sides, and another on its top.
     pub(crate) fn add_item(&mut self, world_from_box: &Transform, half_m: [f64; 3], front: usize, top: usize) {
         let (around, above) = (picture(front), picture(top));
         self.add_textured_box(world_from_box, half_m, &[around, around, around, around, above, above]);
@@ -81,7 +81,7 @@ impl Furniture {
         self.posters.append_at(mesh, world_from_wall);
     }
 
-    /// A bench against a wall, with instruments, screens and cartons; it faces along its x axis.
+    /// A bench against a wall, facing along +x, with instruments, screens and cartons.
     pub(crate) fn bench(&mut self, world_from_bench: &Transform) {
         let [half_length, half_depth, top_m] = BENCH_M;
         let at = |x: f64, y: f64, z: f64| world_from_bench * Translation3::new(x, y, z);
@@ -107,7 +107,7 @@ impl Furniture {
         }
     }
 
-    /// A shelf of five boards full of books and cartons; it faces along its x axis.
+    /// A shelf of five boards, facing along +x, full of books and cartons.
     pub(crate) fn shelf(&mut self, world_from_shelf: &Transform) {
         let [half_length, half_depth, height_m] = SHELF_M;
         let at = |x: f64, y: f64, z: f64| world_from_shelf * Translation3::new(x, y, z);
@@ -151,7 +151,7 @@ impl Furniture {
         }
     }
 
-    /// Adds all larger solids as occluders. Clutter on boards casts no shadow visible on the floor.
+    /// Adds all larger boxes as occluders. Shadows of small items on shelves would not be visible on the floor.
     pub(crate) fn add_occluders(&self, occluders: &mut Occluders) {
         const MIN_HALF_M: f64 = 0.22;
         let large = |half_m: &[f64; 3]| half_m.iter().any(|half_m| *half_m >= MIN_HALF_M);

@@ -1,6 +1,6 @@
 //! Procedural textures for rooms: floors, walls, and sheets of 16 small pictures for posters and for items on
 //! shelves.
-#![expect(clippy::cast_possible_truncation, reason = "places on a sheet are small whole numbers")]
+#![expect(clippy::cast_possible_truncation, reason = "picture indices on a sheet are small integers")]
 
 use crate::mesh::TextureRect;
 use crate::random::RandomStream;
@@ -272,7 +272,7 @@ pub(crate) fn floor_tiles(size_m: [f64; 2], lane_m: f64) -> Texture {
     })
 }
 
-/// A painted wall of panels, 3 m high and wide, to be repeated: a green dado, a rail, plaster above.
+/// A repeating texture of a painted wall, 3 m high and wide: a green dado, a rail, plaster above.
 pub(crate) fn painted_wall() -> Texture {
     let (rough, stain) = (Noise::new(131), Noise::new(132));
     Texture::paint(SIDE_PX, |u, v| {

@@ -1,7 +1,7 @@
 //! Simulated rigs in MuJoCo, behind the traits of `drivers`.
 //!
-//! [`open`] builds a rig. [`Rig::into_lockstep`] runs it as fast as the caller takes samples and gives the same bits
-//! for the same seed. [`Rig::into_live`] runs it in real time as devices.
+//! [`open`] builds a rig. [`Rig::into_lockstep`] runs it as fast as the caller takes samples; the same seed gives
+//! bit-identical samples. [`Rig::into_live`] runs it in real time as devices.
 //!
 //! ```no_run
 //! use sim::Config;
@@ -47,7 +47,7 @@ mod texture;
 mod toy;
 pub mod wire;
 
-/// Positions and dimensions in the scenes, for checking images and scans of them.
+/// Positions and dimensions in the scenes, for tests that check images and scans.
 pub mod layout {
     pub use crate::lab::{PEDESTAL_HALF_M, ROOM_HALF_M, ROOM_HEIGHT_M};
     pub use crate::objects::{

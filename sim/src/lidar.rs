@@ -1,5 +1,5 @@
-//! A rotating range scanner: one ray per direction, cast from the scanner's pose at that instant.
-#![expect(clippy::cast_possible_truncation, reason = "points are in f32, times within a revolution fit their integers")]
+//! A rotating range scanner: each ray is cast from the scanner's pose at the ray's instant.
+#![expect(clippy::cast_possible_truncation, reason = "points are in f32, and times within a revolution fit a u32")]
 
 use crate::Error;
 use crate::config::ScannerConfig;
@@ -16,7 +16,7 @@ pub(crate) struct RayCaster {
     data: MjData<Arc<MjModel>>,
 }
 
-/// Geometry groups that rays hit: all but the robot and glass.
+/// Geometry groups that rays hit: all except the robot and glass.
 fn visible_groups() -> [u8; 6] {
     let mut groups = [1; 6];
     groups[ARM_GROUP] = 0;
@@ -48,7 +48,8 @@ impl RayCaster {
     }
 }
 
-/// One revolution. `world_from_base` returns the base pose at a number of nanoseconds after its start.
+/// Scans one revolution. `world_from_base` returns the base pose at a time in nanoseconds after the start of the
+/// revolution.
 pub(crate) fn scan_revolution(
     rays: &mut RayCaster,
     scanner: &ScannerConfig,
@@ -62,7 +63,7 @@ pub(crate) fn scan_revolution(
     let mut points = Vec::new();
     for column in 0..scanner.n_columns {
         let share = f64::from(column) / f64::from(scanner.n_columns);
-        // Points carry whole microseconds.
+        // The time offset of a point is stored in whole microseconds.
         let offset_micros = (share * period_nanos * 1e-3) as u32;
         let world_from_scanner = world_from_base(i64::from(offset_micros) * 1000) * scanner.base_from_scanner;
         let (sin, cos) = (share * std::f64::consts::TAU).sin_cos();

@@ -1,7 +1,7 @@
 //! Scene lighting: computes how much light reaches each point and bakes it into the textures.
 //!
 //! Nothing in front of a wrist camera moves, so shadows can be computed once instead of for every image. This halves
-//! the rendering time and gives the lamp an extent: shadows are soft, and corners get less ambient light.
+//! the rendering time and allows soft shadows from an extended lamp and ambient occlusion in corners.
 
 use crate::random::RandomStream;
 use kinematics::Transform;
@@ -42,8 +42,7 @@ impl Lamp {
     }
 }
 
-/// The lamps and the ambient light as MJCF, scaled by a factor: elements of the world body, and of the visual
-/// settings.
+/// MJCF of the lamps (elements of the world body) and of the ambient light (a visual setting), both scaled by `gain`.
 pub(crate) fn mjcf(gain: f64) -> (String, String) {
     let list = |numbers: [f64; 3]| numbers.map(|number| (gain * number).to_string()).join(" ");
     let mut lamps = String::new();
@@ -67,7 +66,7 @@ pub(crate) struct Occluders {
     ellipsoids: Vec<Ellipsoid>,
     /// Sphere around all ellipsoids.
     bounds: (Point3<f64>, f64),
-    /// Objects farther away do not block ambient light, meters.
+    /// Maximum distance at which an object blocks ambient light, meters.
     ambient_reach_m: f64,
 }
 
@@ -87,7 +86,7 @@ impl Occluders {
         self.boxes.push((world_from_box.inverse(), Vector3::from(half_m)));
     }
 
-    /// Adds ellipsoids by center and half axes that lie inside a bounding sphere.
+    /// Adds ellipsoids, given by center and half axes, that lie inside a bounding sphere.
     pub(crate) fn add_ellipsoids(
         &mut self,
         ellipsoids: impl Iterator<Item = (Point3<f64>, [Vector3<f64>; 3])>,
@@ -158,7 +157,7 @@ impl Occluders {
     }
 }
 
-/// Whether a ray hits the unit sphere, or starts inside it, before `reach`.
+/// Whether a ray hits the unit sphere before `reach`, or starts inside the sphere.
 fn hits_sphere(from: &Vector3<f64>, direction: &Vector3<f64>, reach: f64) -> bool {
     let (a, b, c) = (direction.norm_squared(), from.dot(direction), from.norm_squared() - 1.0);
     let inside = b * b - a * c;
@@ -166,7 +165,7 @@ fn hits_sphere(from: &Vector3<f64>, direction: &Vector3<f64>, reach: f64) -> boo
         return false;
     }
     let root = inside.sqrt();
-    // Leaves the sphere after the start and enters it before the reach.
+    // The ray leaves the sphere after its start and enters it before `reach`.
     -b + root > 0.0 && -b - root < reach * a
 }
 

@@ -19,14 +19,14 @@ const MAX_READINGS: usize = 1000;
 const MAX_SCANS: usize = 20;
 /// Queue length for the ground-truth images of a camera, which are large.
 const MAX_TRUTH_IMAGES: usize = 8;
-/// The simulation skips images once it is later than this.
+/// Delay beyond which the simulation skips images.
 const MAX_LATE: Duration = Duration::from_millis(50);
 
 /// Simulated devices that deliver in real time.
 pub struct LiveRig {
-    /// Cameras in the order of the configuration, the arm, the base if it moves, scanners.
+    /// Cameras in the order of the configuration, the arm, the base if it moves, and the scanners.
     pub devices: Devices,
-    /// Ground truth of color images and base poses. The oldest is dropped if nobody takes it.
+    /// Ground truth of color images and base poses. If its queue is full, the oldest entry is dropped.
     pub truth: LiveTruth,
     /// True parameters of the rig.
     pub info: RigInfo,
@@ -38,7 +38,7 @@ pub struct LiveTruth {
 }
 
 impl LiveTruth {
-    /// Returns the oldest truth not taken yet, without waiting; poses first.
+    /// Returns the oldest queued ground truth without waiting; base poses come before images.
     pub fn take(&self) -> Option<Sample> {
         let mut state = self.simulation.shared.state.lock();
         state.truth_poses.pop_front().or_else(|| state.truth_images.pop_front())
@@ -55,7 +55,7 @@ impl Drop for SimulationThread {
     fn drop(&mut self) {
         self.shared.state.lock().stop = true;
         if let Some(thread) = self.thread.take() {
-            // A panic of the thread was reported by the panic hook.
+            // The panic hook has already reported a panic of the thread.
             let _ = thread.join();
         }
     }
@@ -71,7 +71,7 @@ struct SharedQueues {
 struct QueueState {
     /// One queue per camera.
     images: Vec<VecDeque<Image>>,
-    /// Number of dropped images of each camera not yet reported: color and depth.
+    /// Number of dropped color and depth images of each camera that are not yet reported.
     n_dropped: Vec<[u64; 2]>,
     readings: VecDeque<JointState>,
     poses: VecDeque<BasePose>,
@@ -79,7 +79,7 @@ struct QueueState {
     scans: Vec<VecDeque<RangeScan>>,
     truth_images: VecDeque<Sample>,
     truth_poses: VecDeque<Sample>,
-    /// Reason why there are no more samples.
+    /// Why there are no more samples.
     end: Option<String>,
     stop: bool,
 }

@@ -4,7 +4,7 @@ use crate::engine::Engine;
 use crate::rig_info::RigInfo;
 use drivers::{Sample, Source};
 
-/// Samples of a rig in delivery order. The same configuration and machine give the same bits.
+/// Samples of a rig in delivery order. On one machine, the same configuration gives bit-identical samples.
 pub struct Lockstep {
     engine: Engine,
     info: RigInfo,

@@ -42,7 +42,7 @@ impl Mesh {
         self.faces.push(corners);
     }
 
-    /// Adds a flat rectangle that faces along `right x up`, its texture upright.
+    /// Adds a flat rectangle with the normal `right x up` and an upright texture.
     pub(crate) fn rectangle(
         &mut self,
         center: Point3<f64>,
@@ -76,7 +76,7 @@ impl Mesh {
     }
 
     /// Adds an ellipsoid given by three perpendicular half axes. `texture_x` maps a point and its normal to the
-    /// horizontal texture coordinate; `texture_y` is the same for all.
+    /// horizontal texture coordinate; `texture_y` is constant.
     pub(crate) fn add_ellipsoid(
         &mut self,
         center: Point3<f64>,
@@ -147,14 +147,15 @@ impl Mesh {
     /// A surface of revolution about z. The profile is a list of `(radius, z)` in meters; the outside is on the right
     /// of an upward profile.
     ///
-    /// The texture wraps around once, with its top at the first point. Normals are smooth between points on a bend.
+    /// The texture wraps around the axis once; its top is at the first point. With `is_smooth`, normals are averaged
+    /// where pieces of the profile meet.
     pub(crate) fn lathe(profile_m: &[[f64; 2]], n_sectors: u32, texture: TextureRect, is_smooth: bool) -> Self {
         let mut mesh = Self::default();
         let [left, top, right, bottom] = texture;
         let n_pieces = profile_m.len() - 1;
         let slope = |piece: usize| {
             let [a, b] = [profile_m[piece], profile_m[piece + 1]];
-            // Points outward for a profile that goes up outside.
+            // The normal of this piece of the profile.
             Vector3::new(b[1] - a[1], 0.0, a[0] - b[0]).normalize()
         };
         let bend = |piece: usize, end: usize| {
@@ -224,7 +225,8 @@ pub(crate) fn sphere_direction(down: f64, around: f64) -> Vector3<f64> {
     Vector3::new(sin_down * cos_around, sin_down * sin_around, cos_down)
 }
 
-/// Outward normal of an ellipsoid where its unit sphere has `direction`; the half axes are perpendicular.
+/// Outward normal of an ellipsoid at the point that corresponds to `direction` on the unit sphere; the half axes are
+/// perpendicular.
 pub(crate) fn ellipsoid_normal(half_axes: &[Vector3<f64>; 3], direction: &Vector3<f64>) -> Vector3<f64> {
     let sum = half_axes[0] * (direction.x / half_axes[0].norm_squared())
         + half_axes[1] * (direction.y / half_axes[1].norm_squared())

@@ -92,7 +92,7 @@ struct Holes {
 const MAX_EDGE_SHARE: f64 = 0.6;
 /// Side of a cluster of holes, pixels.
 const CLUSTER_PX: usize = 4;
-/// Start of the hole counters, past those of the noise.
+/// First random counter used for holes; the noise uses smaller ones.
 const HOLE_COUNTERS: u64 = 1 << 40;
 
 impl Holes {
@@ -120,7 +120,8 @@ impl Holes {
     }
 }
 
-/// Marks the pixels of a row where depth jumps within two pixels, where only one of the two imagers sees the surface.
+/// Marks the pixels of a row within two pixels of a depth jump. There, the surface is visible to only one of the two
+/// imagers.
 fn mark_edges(is_edge: &mut [bool], depth_m: &[f32]) {
     const EDGE_RADIUS_PX: usize = 2;
     const JUMP_FRAC: f32 = 0.03;

@@ -16,7 +16,7 @@ pub const CUBE_HALF_M: f64 = 0.03;
 /// Half sizes of the wooden block, meters.
 pub const BLOCK_HALF_M: [f64; 3] = [0.045, 0.02, 0.025];
 
-/// Half sizes of the table's top along x and y, and its nearest x, meters.
+/// Half sizes of the table top along x and y, and x of its near edge, meters.
 const TABLE_HALF_XY_M: [f64; 2] = [0.40, 0.50];
 const TABLE_FRONT_X_M: f64 = TARGET_XY_M[0] - 0.34;
 const TABLE_HALF_THICKNESS_M: f64 = 0.02;
@@ -37,7 +37,7 @@ pub fn world_from_cube() -> Transform {
     on_table(-0.035, 0.062, CUBE_HALF_M, 28.0)
 }
 
-/// Pose of a tag on the cube by its id, 0 to 5: x to the right of the print, y down, z into it.
+/// Pose of a tag on the cube by its id, 0 to 5: x points right on the printed tag, y down, z into the cube.
 pub fn world_from_tag(id: usize) -> Transform {
     let (outward, right, up) = BOX_FACES[id];
     let [outward, right, up] = [outward, right, up].map(Vector3::from);
@@ -60,8 +60,8 @@ fn table_center() -> Point3<f64> {
     Point3::new(TABLE_FRONT_X_M + TABLE_HALF_XY_M[0], 0.0, TABLE_Z_M)
 }
 
-/// The wall on the side of +y (1) or -y (-1): x outward to the room, z up. Both run back from the corner at 45
-/// degrees.
+/// Pose of the wall on the +y side (1) or -y side (-1): x points into the room, z up. From the corner behind the table,
+/// both walls run toward the robot at 45 degrees.
 fn world_from_wall(side: f64) -> Transform {
     let half = WALL_HALF_M[0] * std::f64::consts::FRAC_1_SQRT_2;
     let center = Translation3::new(CORNER_XY_M[0] - half, CORNER_XY_M[1] + side * half, TABLE_Z_M + WALL_HALF_M[1]);
@@ -139,7 +139,7 @@ pub(crate) fn shade_box(texture: &mut Texture, occluders: &Occluders, half_m: [f
 
 fn occluders() -> Occluders {
     const WALL_HALF_THICKNESS_M: f64 = 0.005;
-    /// About the size of the objects.
+    /// Similar to the size of the objects.
     const AMBIENT_REACH_M: f64 = 0.25;
     let mut occluders = Occluders::new(AMBIENT_REACH_M);
     occluders.add_box(world_from_cube(), [CUBE_HALF_M; 3]);

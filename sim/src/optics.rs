@@ -25,7 +25,7 @@ pub(crate) struct Optics {
     drawn_pinhole_px: [[f32; 2]; 2],
 }
 
-/// Pose of the rendered image relative to the camera at another instant, in f32.
+/// Pose of the camera at another instant, in the frame of the rendered image, in f32.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct RowMotion {
     rotation_matrix: Matrix3<f32>,
@@ -41,9 +41,9 @@ impl RowMotion {
     }
 }
 
-/// Maximum number of corrections of the pixel position until the depth there matches the ray.
+/// Maximum number of iterations that correct the pixel position until its depth matches the ray.
 const MAX_CORRECTIONS: usize = 3;
-/// Relative depth tolerance. Within it, a point's position differs by less than 0.02 pixels at the speeds of the arm.
+/// Relative depth tolerance. At the speeds of the arm, it moves a point by less than 0.02 pixels.
 const SAME_DEPTH_FRAC: f32 = 0.005;
 
 impl Optics {
@@ -69,8 +69,7 @@ impl Optics {
                 rays.push([point.x as f32, point.y as f32]);
             }
         }
-        // Margin for content that rolling shutter and blur bring in from outside: a few pixels at the speeds of the
-        // arm.
+        // Rolling shutter and blur show content from outside the image: a few pixels at the speeds of the arm.
         let margin_px = if is_motion_free { 0 } else { 4 + height / 60 };
         let mut optics = Self {
             view_size_px: [0; 2],
@@ -86,7 +85,7 @@ impl Optics {
             let (first, last) = optics.bounds(axis);
             let margin = f64::from(margin_px * supersample);
             optics.view_principal_px[axis] = margin - first * optics.view_focal_px[axis];
-            // Keeps rounding noise from adding a pixel.
+            // The subtraction prevents rounding errors from adding a pixel.
             let extent = ((last - first) * optics.view_focal_px[axis] + 2.0 * margin - 1e-2).ceil();
             optics.view_size_px[axis] = extent.clamp(1.0, f64::from(MAX_VIEW_PX)) as u32;
         }
@@ -136,7 +135,7 @@ impl Optics {
         })
     }
 
-    /// One row of a pinhole camera's pixels, each of which covers whole rendered pixels.
+    /// Colors of one row of a pinhole camera. Each pixel covers a whole number of rendered pixels.
     fn average_blocks(&self, picture: &Picture, row: usize, colors: &mut [[f32; 3]]) {
         let (side, stride) = (self.supersample as usize, 3 * picture.size_px[0] as usize);
         let margin = (self.margin_px * self.supersample) as usize;
@@ -156,17 +155,17 @@ impl Optics {
         }
     }
 
-    /// Color of each pixel when its row is exposed at other instants, averaged over them.
+    /// Color of each pixel, averaged over the instants at which its row is exposed.
     ///
-    /// `row_motions` holds the motions of the first row, then of the second. Each pixel's ray is traced into the
-    /// rendered image using the rendered depth, so surfaces have the correct positions. Only a strip next to a depth
-    /// edge, as wide as the edge's parallax over the readout, repeats the adjacent content.
+    /// `row_motions` holds all motions of the first row, then of the second, and so on. Each pixel's ray is traced into
+    /// the rendered image with the rendered depth, so surfaces have the correct positions. The exception is a strip
+    /// next to each depth edge, as wide as the parallax during the readout, which repeats the adjacent content.
     pub(crate) fn motion_blurred(&self, picture: &Picture, row_motions: &[RowMotion]) -> Vec<f32> {
         let n_samples = row_motions.len() / self.intrinsics.size_px[1] as usize;
         let share = 1.0 / n_samples as f32;
         self.expose(|row, colors| {
             for row_motion in &row_motions[row * n_samples..(row + 1) * n_samples] {
-                // The search starts at the neighboring pixel's offset, which is almost the same.
+                // The search starts at the offset of the previous pixel, because neighboring offsets are almost equal.
                 let mut offset_px = [0.0; 2];
                 for (color, ray) in colors.iter_mut().zip(self.row_of_rays(row)) {
                     let static_px = self.drawn_from_ray(ray);
@@ -267,7 +266,7 @@ impl Optics {
     }
 
     /// Depth at a position in the rendered image: the mean of the four surrounding pixels if they lie on one surface,
-    /// else the nearest depth of the four. With odd supersampling, the depth of the closest pixel.
+    /// else the smallest of the four depths. With odd supersampling, it is the depth of the pixel at this position.
     fn depth_at(&self, picture: &Picture, at: [f32; 2]) -> f32 {
         /// Neighbors whose depths differ by more than this fraction belong to different surfaces.
         const SAME_SURFACE_FRAC: f32 = 0.01;
@@ -305,7 +304,7 @@ fn between_pixels(picture: &Picture, at: [f32; 2]) -> [f32; 3] {
 const MAX_VIEW_PX: u32 = 8192;
 
 fn nearest_depth(picture: &Picture, at: [f32; 2]) -> f32 {
-    // Uses u32 because processors convert to it in fewer instructions.
+    // Converting to u32 takes fewer instructions than converting to usize.
     let index = |axis: usize| (at[axis].max(0.0) as u32).min(picture.size_px[axis] - 1) as usize;
     picture.depth_m[index(1) * picture.size_px[0] as usize + index(0)]
 }

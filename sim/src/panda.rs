@@ -9,10 +9,11 @@ use std::fmt::Write as _;
 
 /// Joint positions, velocities or torques.
 pub(crate) type Joints = SVector<f64, N_JOINTS>;
-/// Velocity of a frame's origin and angular velocity, both in world axes, per joint velocity.
+/// Linear velocity of a frame's origin and angular velocity, both in world axes, per unit of joint velocity.
 pub(crate) type Jacobian = SMatrix<f64, 6, N_JOINTS>;
 
-/// Craig's parameters of a joint: distance a and angle alpha about the previous x axis, offset d along the joint's own axis.
+/// Craig's parameters of a joint: distance a along and angle alpha about the previous x axis, offset d along the joint
+/// axis.
 struct Link {
     a_m: f64,
     alpha_rad: f64,

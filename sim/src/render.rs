@@ -74,7 +74,7 @@ impl Pending {
 }
 
 fn render_thread_stopped() -> Error {
-    Error::Stopped { reason: "it did not answer".to_owned() }
+    Error::Stopped { reason: "it sent no image".to_owned() }
 }
 
 impl Renderer {
@@ -136,13 +136,13 @@ fn draw_all(
         context,
         near_far_m,
     };
-    // Drivers compile their shaders for the first image, which takes seconds on a busy processor. Without the
-    // warm-up, a camera would appear to be silent for that time.
+    // OpenGL drivers compile their shaders for the first image, which takes seconds on a busy processor. Without this
+    // warm-up, cameras would send nothing for that time.
     canvas.draw(&View::warm_up());
     // A closed channel means that the rig was dropped; `queue` is then closed as well.
     let _ = ready.send(Ok(current.renderer().to_owned()));
     for job in queue {
-        // This requester may have given up; later ones may still be waiting.
+        // Sending fails if the requester has given up. Later requesters may still be waiting.
         let _ = job.reply.send(canvas.draw(&job.view));
     }
 }
@@ -174,7 +174,7 @@ impl Canvas {
         self.read(view.size_px, &viewport)
     }
 
-    /// Sets both of the scene's cameras; MuJoCo renders from their mean.
+    /// Sets both (stereo) cameras of the scene; MuJoCo renders from their mean.
     fn set_view(&mut self, view: &View) {
         let [near, far] = self.near_far_m;
         let pose = &view.world_from_camera;
@@ -182,7 +182,7 @@ impl Canvas {
         let [width, height] = view.size_px.map(f64::from);
         let at_near = |pixels: f64, axis: usize| pixels * near / view.focal_px[axis];
         let [left, right] = [at_near(-view.principal_px[0], 0), at_near(width - view.principal_px[0], 0)];
-        // SAFETY: only cameras and flags are written, which contain plain numbers.
+        // SAFETY: only cameras and flags are written, and they contain only numbers.
         let scene = unsafe { self.scene.ffi_mut() };
         for camera in &mut scene.camera {
             camera.pos = in_f32(pose.translation.vector);
@@ -200,7 +200,7 @@ impl Canvas {
 
     /// Scales the brightness of all lamps.
     fn scale_lights(&mut self, light_frac: f32) {
-        // SAFETY: only colors of lamps are written, which contain plain numbers.
+        // SAFETY: only colors of lamps are written, and they contain only numbers.
         let scene = unsafe { self.scene.ffi_mut() };
         let n_lamps = usize::try_from(scene.nlight).unwrap_or(0);
         for lamp in scene.lights.iter_mut().take(n_lamps) {

@@ -24,7 +24,7 @@ const MOBILE_ARM_URDF: &str = include_str!("../../rigs/robots/mobile-arm.urdf");
 /// The quadruped as a URDF: root `base`, `top_plate` on its back.
 const QUADRUPED_URDF: &str = include_str!("../../rigs/robots/quadruped.urdf");
 
-/// The robot of a scene.
+/// URDF of a scene's robot.
 pub(crate) fn urdf_of(scene: Scene) -> &'static str {
     match scene {
         Scene::StaticArm => PANDA_URDF,
@@ -73,7 +73,8 @@ pub fn open(config: &Config) -> Result<Rig, Error> {
     Ok(Rig { engine, info })
 }
 
-/// `flange_from_camera` of the camera that the scan aims: the first one on the flange, or a default if there is none.
+/// `flange_from_camera` of the camera that follows the tour: the first one on the flange, or a default if there is
+/// none.
 fn scanning_camera(config: &Config) -> Transform {
     let on_flange = config.cameras.iter().find(|camera| camera.parent == Parent::Flange);
     on_flange.map_or_else(|| CameraConfig::wrist("wrist").parent_from_camera, |camera| camera.parent_from_camera)

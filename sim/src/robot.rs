@@ -39,7 +39,7 @@ impl Robot {
         &self.motion
     }
 
-    /// Advances by one step. Returns the time before it, nanoseconds, and the joint reading at that time.
+    /// Advances by one step. Returns the time before the step, nanoseconds, and the joint reading at that time.
     pub(crate) fn step(&mut self) -> (i64, Option<JointReading>) {
         let nanos = self.n_steps * STEP_NANOS;
         self.n_steps += 1;

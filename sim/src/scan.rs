@@ -8,8 +8,8 @@ use std::f64::consts::TAU;
 /// The tour around the target area.
 ///
 /// Azimuth, elevation, distance, roll and look-at point oscillate with periods that have no common multiple, so the
-/// first seconds cover the whole range coarsely and later ones fill the gaps. Every oscillation goes both ways and
-/// its speed changes continuously, so a time offset and a hand-eye error have different effects.
+/// first seconds cover the whole range coarsely and later ones fill the gaps. Every quantity moves both ways at
+/// continuously changing speed, so a time offset and a hand-eye error have different effects.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Scan {
     speed: f64,

@@ -16,7 +16,7 @@ use std::sync::Arc;
 
 /// Group of the arm's geometry, so that it can be hidden.
 pub(crate) const ARM_GROUP: usize = 1;
-/// Group of the geometry that light passes through.
+/// Group of transparent geometry.
 pub(crate) const GLASS_GROUP: usize = 2;
 
 /// Near and far plane, meters.
@@ -84,7 +84,7 @@ pub(crate) fn build(config: &Config, largest_px: [u32; 2]) -> Result<MjModel, Er
     MjModel::from_xml_vfs("scene.xml", &files).map_err(|error| Error::Scene { reason: error.to_string() })
 }
 
-/// The robot as a body of the world: an arm alone, or a base that carries one or none.
+/// MJCF body of the robot: an arm alone, or a base with or without an arm.
 fn robot(config: &Config) -> String {
     let arm = if config.scene.has_arm() { panda::mjcf(&brackets(config)) } else { String::new() };
     if !config.scene.has_moving_base() {
@@ -117,7 +117,8 @@ fn extra_materials(scene: Scene) -> &'static str {
     }
 }
 
-/// Assets created once per process: they take a second and do not depend on the configuration.
+/// Assets of a scene. They are created once per process, because this takes a second and does not depend on the
+/// configuration.
 struct SceneAssets {
     textures_png: Vec<(&'static str, Vec<u8>)>,
     objects: Vec<Object>,
@@ -154,7 +155,7 @@ fn add_file(files: &mut MjVfs, name: &str, bytes: &[u8]) -> Result<(), Error> {
     files.add_from_buffer(name, bytes).map_err(|error| Error::Scene { reason: format!("{name}: {error}") })
 }
 
-/// Bodies of the cameras on the flange, just behind their optical centers.
+/// Camera bodies on the flange, just behind the optical centers.
 fn brackets(config: &Config) -> String {
     let mut xml = String::new();
     for camera in config.cameras.iter().filter(|camera| camera.parent == Parent::Flange) {

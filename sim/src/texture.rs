@@ -31,10 +31,10 @@ impl Texture {
 
     /// Darkens a rectangle (left, top, right, bottom) by light fractions sampled on an `n` x `n` grid.
     ///
-    /// `share_at` receives the position in the rectangle, 0 to 1 from its top left, and an index of the sample.
+    /// `share_at` receives the position in the rectangle, 0 to 1 from its top left, and the index of the sample.
     pub(crate) fn shade(&mut self, rectangle: [f64; 4], n: usize, share_at: impl Fn(f64, f64, u64) -> f64 + Sync) {
         let step = 1.0 / (n - 1) as f64;
-        // On the very edge, a point may lie inside the adjacent object.
+        // Exactly on the edge, a point may lie inside the adjacent object.
         let inside = |at: usize| (at as f64 * step).clamp(EDGE, 1.0 - EDGE);
         let shares: Vec<f64> =
             (0..n * n).into_par_iter().map(|ix| share_at(inside(ix % n), inside(ix / n), ix as u64)).collect();
@@ -135,7 +135,7 @@ impl Noise {
         top * (1.0 - fy) + bottom * fy
     }
 
-    /// Noise of several sizes, each half as large and half as strong, 0 to 1.
+    /// Sum of octaves of noise, each with half the size and half the amplitude of the previous one, 0 to 1.
     pub(crate) fn rough(&self, x: f64, y: f64, n_octaves: i32) -> f64 {
         let octaves = (0..n_octaves).map(|octave| (f64::from(octave) * 17.3, 2f64.powi(octave)));
         let sum: f64 = octaves.map(|(shift, finer)| self.at(x * finer + shift, y * finer + shift) / finer).sum();

@@ -5,14 +5,14 @@ use crate::random::RandomStream;
 use crate::texture::{FUR_DARKEST, FurBand};
 use nalgebra::{Point3, UnitQuaternion, Vector3};
 
-/// One part of the body: an ellipsoid, covered with hair or not.
+/// One part of the body: an ellipsoid with or without hair.
 struct Part {
     center_m: [f64; 3],
     /// Half sizes along the part's axes.
     half_m: [f64; 3],
     /// Rotation about y, radians: positive tips the part's x axis down.
     pitch_rad: f64,
-    /// Rotation about x before that, radians.
+    /// Rotation about x, applied before `pitch_rad`, radians.
     roll_rad: f64,
     band: FurBand,
     n_hairs: u64,
@@ -43,7 +43,7 @@ impl Part {
     }
 }
 
-/// Factor on the hair counts below, in units of 1/2.
+/// Twice the factor on the hair counts below.
 const DENSITY: u64 = 3;
 
 /// The toy stands on z = 0, looks along x, and is 0.15 m high.
@@ -95,10 +95,10 @@ pub(crate) fn body(light: Light<'_>) -> Mesh {
     let mut mesh = Mesh::default();
     for part in &PARTS {
         let [tip, root] = part.band.rows();
-        // Skin has the color of the hair roots if hair grows on it, else the colors of the whole band.
+        // Under hair, the skin has a color close to the roots; bare skin has the middle color of the band.
         let texture_y = if part.n_hairs > 0 { 0.3 * tip + 0.7 * root } else { 0.5 * (tip + root) };
         let texture_x = |point: &Point3<f64>, normal: &Vector3<f64>| {
-            // Patches as small as tufts, so that skin between hairs does not look bare.
+            // Brightness varies at the scale of tufts, so that skin between hairs does not look bare.
             let tuft = RandomStream::new(0x70f7, &[point.x.to_bits(), point.z.to_bits()]).between(0, 0.45, 0.9);
             texture_x(tuft * light(point, normal, 0))
         };
@@ -153,7 +153,7 @@ struct Hair {
     band: FurBand,
 }
 
-/// Adds a tapered hair of two segments that leans back and droops. Uses five counters.
+/// Adds a tapered hair of two segments that leans back and droops. Uses five random counters.
 fn grow_hair(mesh: &mut Mesh, light: Light<'_>, random: RandomStream, counter: u64, hair: &Hair) {
     let jitter = Vector3::new(
         random.between(counter, -0.45, 0.45),
@@ -175,7 +175,7 @@ fn grow_hair(mesh: &mut Mesh, light: Light<'_>, random: RandomStream, counter: u
         side * cos + across * sin
     });
     let row = |share: f64| band_root + (band_tip - band_root) * share;
-    // The skin's normal is blended in, so that the coat is shaded as a whole.
+    // Blending in the skin's normal shades the coat as one surface.
     let shade = |outward: &Vector3<f64>| (outward * 0.5 + hair.normal).normalize();
     let mut ring = |center: Point3<f64>, radius: f64, share: f64| {
         corners.map(|outward| {

@@ -41,7 +41,7 @@ fn live_devices_deliver_until_the_rig_ends() {
     };
     assert!(matches!(end, drivers::Error::Simulation { .. }), "{end}");
     assert!(n_color >= 1 && n_depth >= 1, "{n_color} color, {n_depth} depth");
-    // Nobody took images while the joints were read: images that did not fit in the queue were counted.
+    // No images were taken while the joints were read. Images that did not fit in the queue were dropped and counted.
     assert!(
         n_color + n_dropped <= 15 && n_color + n_depth <= 8,
         "{n_color} color, {n_depth} depth, {n_dropped} dropped"

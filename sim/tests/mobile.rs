@@ -72,10 +72,10 @@ fn scans_hit_the_walls_within_their_noise() {
                 past_wall_m[0] < 0.15 && past_wall_m[1] < 0.15 && at.z > -0.15 && at.z < ROOM_HEIGHT_M + 0.15,
                 "{at}"
             );
-            // Only walls remain above all furniture and below the lamps.
+            // At this height, above the furniture and below the lamps, there are only walls.
             if at.z > 2.15 && at.z < 2.6 {
                 let ray = (at.coords - world_from_scanner.translation.vector).normalize();
-                // The error along a ray that hits a wall at an angle.
+                // The range error: the ray hits the wall at an angle.
                 let (axis, off) =
                     if past_wall_m[0] > past_wall_m[1] { (0, past_wall_m[0]) } else { (1, past_wall_m[1]) };
                 squares += (off / ray[axis].abs()).powi(2);
@@ -105,7 +105,7 @@ fn reported_poses_drift_and_ground_truth_is_exact() {
             && distance_m(run.reported_base.len() - 1) < 0.1
     );
     for truth in &run.truth {
-        // Base poses come every 10 ms with images in between; the tolerance covers linear interpolation.
+        // Base poses are 10 ms apart; the tolerance covers linear interpolation at the stamps of the images.
         let ix = run.true_base.partition_point(|pose| pose.stamp < truth.image.stamp).clamp(1, run.true_base.len() - 1);
         let (a, b) = (&run.true_base[ix - 1], &run.true_base[ix]);
         let share = truth.image.stamp.secs_since(a.stamp) / b.stamp.secs_since(a.stamp);
@@ -131,7 +131,7 @@ fn runs_are_deterministic_per_seed() {
 
 #[test]
 fn separate_depth_sensor_matches_color_camera() {
-    const TOLERANCE_FRAC: f64 = 0.01; // A pixel of slanted surface; wrong frames or lenses are off by ten times more.
+    const TOLERANCE_FRAC: f64 = 0.01; // A pixel on a slanted surface; a wrong frame or lens causes ten times this.
     let config = Config { ideal: true, n_images: Some(4), ..mobile_arm(1.0) };
     let run = run_rig(&config);
     let color = lens_of(&config);
@@ -152,7 +152,7 @@ fn separate_depth_sensor_matches_color_camera() {
             n_matching += usize::from((depth_m / in_color.z - 1.0).abs() < TOLERANCE_FRAC);
         }
     }
-    // The rest are depth edges, which the two sensors see differently.
+    // The other pixels are at depth edges, which look different from the two sensors.
     assert!(n_valid > 20_000 && n_matching as f64 > 0.93 * f64::from(n_valid), "{n_matching} of {n_valid}");
 }
 
@@ -187,7 +187,7 @@ fn mean_image_scores_low_and_noise_ceiling_is_high() {
 fn light_changes_when_camera_enters_cabinet() {
     let run_with_light = |light_inside_frac: f64| {
         let config = mobile_arm(0.25);
-        // Second station, the camera in the cabinet: 19 s, 9 s outside, 11 s on the way in.
+        // Ends with the camera in the cabinet: 19 s to reach the second station, 9 s outside, 11 s on the way in.
         let config = Config { light_inside_frac, duration_secs: Some(40.0), truth_depth: false, ..config };
         run_rig(&config)
     };

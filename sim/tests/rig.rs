@@ -125,7 +125,7 @@ fn scan_stays_within_limits_and_covers_the_target() {
     assert!(span(&distances) > 0.12, "distance {}", span(&distances));
 }
 
-/// Franka's acceleration limits of the arm.
+/// Franka's acceleration and jerk limits.
 const MAX_ACCELERATION_RAD_S2: [f64; 7] = [15.0, 7.5, 10.0, 12.5, 15.0, 20.0, 20.0];
 const MAX_JERK_RAD_S3: [f64; 7] = [7500.0, 3750.0, 5000.0, 6250.0, 7500.0, 10_000.0, 10_000.0];
 
@@ -170,12 +170,11 @@ fn tag_on_cube_is_at_its_pose_with_id_4() {
 fn tag_edges_are_accurate_to_a_fifth_of_a_pixel() {
     const TOLERANCE_PX: f64 = 0.2;
     let mut config = ideal(3);
-    config.cameras[0].sensor.supersample = 4; // Averaging out aliased edges would need many of them.
+    config.cameras[0].sensor.supersample = 4; // Without it, edges are aliased.
     let run = run_rig(&config);
     let intrinsics = &run.info.cameras[0].intrinsics;
     let truth = run.truth.last().expect("at least one image");
-    // Across the four outer edges of the black border, one cell inside the margin: brightness falls to half at the
-    // edge.
+    // Lines across the four outer edges of the black border. At the edge, brightness is half.
     let edges = [
         ([0.5, 0.05], [0.5, 0.15]),
         ([0.5, 0.95], [0.5, 0.85]),
@@ -198,7 +197,7 @@ fn tag_edges_are_accurate_to_a_fifth_of_a_pixel() {
 
 #[test]
 fn depth_matches_table_and_cube() {
-    const TOLERANCE_M: f64 = 1e-4; // Twice the depth image's resolution of 0.1 mm would be too lax for noise-free depth.
+    const TOLERANCE_M: f64 = 1e-4; // One count of the depth image; rounding takes at most half of it.
     let run = run_rig(&ideal(5));
     let intrinsics = &run.info.cameras[0].intrinsics;
     let truth = run.truth.last().expect("at least one image");
@@ -292,7 +291,7 @@ fn rolling_shutter_uses_the_pose_of_each_row() {
         largest_px = largest_px
             .max((static_pixel(&line[100])[0] - expected[0]).hypot(static_pixel(&line[100])[1] - expected[1]));
     }
-    assert!(largest_px > 3.0 * TOLERANCE_PX, "the shear was only {largest_px} px: nothing was tested");
+    assert!(largest_px > 3.0 * TOLERANCE_PX, "the shear was only {largest_px} px, too small for this test");
 }
 
 #[test]

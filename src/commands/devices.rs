@@ -29,9 +29,9 @@ struct DeviceInfo {
     address: String,
     /// Name that the device reports.
     name: String,
-    /// Whether this build can use it.
+    /// Whether this build can use the device.
     usable: bool,
-    /// How to use it, or why it is not usable.
+    /// How to use the device, or why it cannot be used.
     note: String,
 }
 
@@ -74,7 +74,7 @@ fn simulation() -> DeviceInfo {
     let note = if usable {
         "`--sim` simulates all devices of a rig"
     } else {
-        "built without simulation: `make deps`, then `cargo build --release --features sim`"
+        "built without simulation; run `make deps`, then `cargo build --release --features sim`"
     };
     DeviceInfo { kind: "simulation", address: "--sim".into(), name: "MuJoCo".into(), usable, note: note.into() }
 }
@@ -130,8 +130,7 @@ fn realsense_on_usb(sys: &Path) -> Vec<DeviceInfo> {
         .filter(|device| attribute(&usb.join(device).join("idVendor")).as_deref() == Some(INTEL_USB_VENDOR))
         .filter_map(|device| {
             let name = attribute(&usb.join(&device).join("product")).filter(|name| name.contains("RealSense"))?;
-            let note =
-                "to use driver realsense as well, build with `cargo build --release --features realsense`".into();
+            let note = "to use the driver realsense, build with `cargo build --release --features realsense`".into();
             Some(DeviceInfo { kind: "camera", address: format!("usb {device}"), name, usable: false, note })
         })
         .collect()

@@ -1,4 +1,4 @@
-//! `fieldrig doctor`: checks this computer for a rig and names a remedy for each problem.
+//! `fieldrig doctor`: checks this computer and the devices of a rig, and prints a fix for each problem.
 
 mod gpu;
 mod page_address;
@@ -18,7 +18,7 @@ const DEFAULT_ADDRESS: &str = "127.0.0.1:7007";
 pub(crate) struct Args {
     /// Rig file; its devices are checked, too
     rig: Option<PathBuf>,
-    /// Then read the rig's devices for S seconds and print rates, latencies and losses; nothing is moved
+    /// After the checks, read all devices for S seconds and print rates, latencies and losses; nothing is moved
     #[arg(long, value_name = "S", requires = "rig", value_parser = number_in_range(1.0..=3600.0))]
     listen: Option<f64>,
     /// Print JSON, one object per line

@@ -48,7 +48,7 @@ struct NamedScores {
 /// Renders and scores every test image.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let evaluator = Evaluator::thorough(args.lpips_weights.as_deref())?;
-    // Checked before the data, which takes long to read.
+    // Invalid flags are rejected before the data is read, which takes long.
     args.images.options().holdout()?;
     session::expect(&args.data)?;
     let mut model = methods::load(open_gpu()?, &args.model)?.method;
@@ -62,7 +62,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     }
     if data.rig.as_ref().is_some_and(|rig| differs_from_training_rig(rig, &args.model)) {
         log::warn!(
-            "the model was trained with another rig file, and its camera corrections apply to that one; see --rig"
+            "the model was trained with another rig file, and its camera corrections apply to that file; see --rig"
         );
     }
     let images = evaluator.score_all(model.as_mut(), tests.iter())?;
@@ -82,8 +82,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     Ok(exit::from_losses(&data.data_losses))
 }
 
-/// Reads from the model's rig file whether base poses were realigned in training. Otherwise the poses would not match
-/// the scene.
+/// Takes `base.realign` from the rig file of the model, because the base poses must be treated as in training.
 fn training_overrides(model: &Path) -> Vec<Override> {
     let training_rig = Rig::load(&model.join(drivers::recording::RIG_FILE), &[]);
     training_rig.iter().map(|rig| Override::new("base.realign", rig.base.realign)).collect()
@@ -95,10 +94,10 @@ fn differs_from_training_rig(rig: &Rig, model: &Path) -> bool {
     training_rig.is_ok_and(|training_rig| !rig.has_same_calibration(&training_rig))
 }
 
-/// How many of the test images the model was trained on, according to the list in its folder; 0 if there is no list.
+/// Number of test images that the model was trained on, according to the list in its folder; 0 without a list.
 ///
-/// Image names of a dataset folder are not unique across folders, so for these the list counts only if it is of the
-/// same folder.
+/// Image names are not unique across dataset folders, so the list is used only if the model was trained on the same
+/// folder.
 fn n_trained_on(args: &Args, tests: &[Arc<Keyframe>], is_recording: bool) -> usize {
     let Ok(list) = KeyframeList::load(&args.model.join("keyframes.txt")) else { return 0 };
     if !is_recording && trained_folder(&args.model) != args.data.canonicalize().ok() {

@@ -30,16 +30,15 @@ pub(crate) struct Args {
     /// Simplify the mesh of a distance field to one vertex per cell of this width, meters
     #[arg(long, value_name = "M", value_parser = parse_cell_width)]
     cell_m: Option<f64>,
-    /// Export exactly the keyframes of a recording that this `keyframes.txt` lists [default: those that a run would
-    /// accept]
+    /// Export exactly the keyframes that this `keyframes.txt` lists [default: the keyframes that a run would accept]
     #[arg(long, value_name = "FILE")]
     keyframes: Option<PathBuf>,
 }
 
-/// The format of recordings, a folder.
+/// The output format for recordings: a folder.
 const NERFSTUDIO: &str = "nerfstudio";
 
-/// The formats of all methods, and that of recordings.
+/// The output formats of all methods and of recordings.
 fn formats() -> Vec<PossibleValue> {
     let mut contents: BTreeMap<&str, Vec<&str>> = BTreeMap::new();
     for export in exports() {
@@ -55,7 +54,7 @@ fn formats() -> Vec<PossibleValue> {
     contents.into_iter().map(format).chain([nerfstudio]).collect()
 }
 
-/// The formats of all methods.
+/// The output formats of all methods.
 fn exports() -> impl Iterator<Item = &'static Export> {
     ModelKind::ALL.iter().flat_map(|kind| kind.entry().exports)
 }
@@ -189,7 +188,7 @@ fn sentence(written: Written) -> String {
     let Written { n_images, n_depth, n_depth_skipped } = written;
     let skipped = match n_depth_skipped as u64 {
         0 => String::new(),
-        n => format!(", {} skipped: their lens differs from that of their photo", counted(n, "depth image")),
+        n => format!(", {} skipped: their lens differs from the lens of the photo", counted(n, "depth image")),
     };
     format!("{}, {n_depth} of them with depth{skipped}", counted(n_images as u64, "photo"))
 }

@@ -20,8 +20,8 @@ pub(crate) struct Args {
     base: Option<String>,
     /// Joint values as JSON, `{"joint_names": ["j1", ...], "configurations": [[0.1, ...], ...]}`
     ///
-    /// Radians for revolute joints, meters for prismatic ones, in any order of names. Joints that do not move the tip
-    /// and joints that mimic others may be included; they have no effect.
+    /// Radians for revolute joints, meters for prismatic ones. The names may be in any order. Joints that do not move
+    /// the tip and joints that mimic others may be included; they have no effect.
     #[arg(long, value_name = "FILE.json")]
     joints: PathBuf,
 }

@@ -24,7 +24,7 @@ pub(crate) struct Args {
     #[arg(long, value_name = "FILE")]
     lpips_weights: Option<PathBuf>,
     /// Meters per count, if both images are 16-bit depth
-    #[arg(long, value_name = "METRES", default_value_t = 0.001, value_parser = positive)]
+    #[arg(long, value_name = "METERS", default_value_t = 0.001, value_parser = positive)]
     meters_per_count: f64,
 }
 
@@ -95,6 +95,6 @@ impl Scores {
             self.depth_rmse_m.map(|rmse_m| format!("depth error {:.2} mm", 1e3 * rmse_m)),
         ];
         let known: Vec<_> = parts.into_iter().flatten().collect();
-        if known.is_empty() { "nothing to compare: no pixel has depth in both".to_owned() } else { known.join("  ") }
+        if known.is_empty() { "no pixel has depth in both images".to_owned() } else { known.join("  ") }
     }
 }

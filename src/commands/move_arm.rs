@@ -13,7 +13,7 @@ use serde::Serialize;
 use std::path::PathBuf;
 use std::time::Duration;
 
-/// A target this close to a joint limit counts as within the range, rad or m.
+/// A target may exceed the joint range by this much, rad or m.
 const TOLERANCE_RAD: f64 = 1e-4;
 /// How often Ctrl-C is checked.
 const POLL: Duration = Duration::from_millis(50);
@@ -32,7 +32,7 @@ pub(crate) struct Args {
     /// Move this joint by this much from its current position, rad or m; can be repeated for other joints
     #[arg(long, value_name = "JOINT=DELTA", value_parser = delta)]
     by: Vec<(String, f64)>,
-    /// First recover an arm that has stopped; inspect it before
+    /// Recover an arm that has stopped, before any motion; inspect the arm first
     #[arg(long)]
     recover: bool,
     /// Confirm the motion: nobody is within reach of the arm, and a hand is on the emergency stop
@@ -106,7 +106,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         report_arrival(args, &rig.arm.joints, &target, &last, began)?;
     }
     if motion.on_loss != OnLoss::Hold && !args.exit_on_arrival {
-        log::info!("holding the arm until Ctrl-C; its motors release it then, so support it first");
+        log::info!("holding the arm; support it before you press Ctrl-C, because the motors then release it");
         mover.hold()?;
     }
     mover.bar.finish_and_clear();
@@ -128,7 +128,7 @@ fn check(args: &Args, rig: &Rig) -> Result<(), BadArgument> {
 }
 
 /// Rejects a target outside the joint ranges of the URDF, so that a typing error does not move an arm to its limits. A
-/// joint that is already outside may stay there.
+/// joint that is already outside its range may stay there.
 fn check_range(rig: &Rig, requested: &JointTarget, now: &JointState) -> anyhow::Result<()> {
     let chain = open::chain_of(rig)?;
     for (ix, joint) in rig.arm.joints.iter().enumerate() {
@@ -139,7 +139,7 @@ fn check_range(rig: &Rig, requested: &JointTarget, now: &JointState) -> anyhow::
             && !(lower - TOLERANCE_RAD..=upper + TOLERANCE_RAD).contains(&requested)
         {
             return Err(BadArgument(format!(
-                "joint {joint:?}: target {requested:.4} is outside its range of {lower:.4} to {upper:.4}; it is at {now:.4}, and nothing was moved"
+                "joint {joint:?}: target {requested:.4} is outside its range of {lower:.4} to {upper:.4}; the joint is at {now:.4}, and nothing was moved"
             ))
             .into());
         }
@@ -192,7 +192,7 @@ struct Mover {
 }
 
 impl Mover {
-    /// Reads the next joint state; an arm that has stopped on its own, or reports nothing, is an error.
+    /// Reads the next joint state. Fails if the arm has stopped on its own or reports nothing.
     fn read(&mut self) -> anyhow::Result<JointState> {
         let deadline = clock::now().plus_secs(MAX_SILENCE.as_secs_f64());
         loop {
@@ -211,7 +211,7 @@ impl Mover {
         }
     }
 
-    /// Sends a target; returns the one that was accepted after limits.
+    /// Sends a target; returns it as clamped to the limits.
     fn command(&mut self, requested: &JointTarget) -> Result<JointTarget, Error> {
         let with_offsets = |target: &JointTarget, sign: f64| JointTarget {
             position: target
@@ -225,7 +225,7 @@ impl Mover {
         Ok(with_offsets(&accepted, 1.0))
     }
 
-    /// Waits until the arm arrives. Ctrl-C stops it, which is an error.
+    /// Waits until the arm arrives. Ctrl-C stops the arm and returns an error.
     fn follow(&mut self, target: &JointTarget) -> anyhow::Result<JointState> {
         loop {
             let state = self.read()?;

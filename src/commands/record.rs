@@ -43,7 +43,7 @@ struct Recorded {
     /// Color images.
     images: u64,
     depth_images: u64,
-    /// Color images dropped by the devices, or because the disk was too slow; below, the counts per camera.
+    /// Color images dropped by the devices, or because the disk was too slow. `dropped` has the counts per camera.
     images_dropped_by_devices: u64,
     dropped: BTreeMap<String, DroppedImages>,
     joint_states: u64,
@@ -72,7 +72,7 @@ impl Recorded {
             Sample::Base(_) => self.base_poses += 1,
             Sample::Range(_) => self.range_scans += 1,
             Sample::Truth(_) => self.truths += 1,
-            // Arrives with every base pose.
+            // Not counted, because one arrives with every base pose.
             Sample::BaseTruth(_) => {}
         }
     }
@@ -115,7 +115,7 @@ impl Recorded {
         message
     }
 
-    /// Devices of the rig from which nothing was recorded.
+    /// Devices of the rig without recorded data.
     fn missing_devices(&self, rig: &Rig) -> Vec<String> {
         let arm = (rig.arm.driver != ArmDriver::None && self.joint_states == 0).then_some("joint state of the arm");
         let base = (rig.base.driver != BaseDriver::Fixed && self.base_poses == 0).then_some("pose of the base");
@@ -194,7 +194,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         None => None,
     };
     if let Some(error) = input_error {
-        let finished = format!("a device failed; {} contains the data up to then", args.out.display());
+        let finished = format!("a device failed; {} contains the data up to that point", args.out.display());
         return Err(anyhow::Error::new(error).context(finished));
     }
     if n_written == Some(0) {

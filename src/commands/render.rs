@@ -41,7 +41,8 @@ pub(crate) struct Args {
     /// Render a 360-degree equirectangular image instead of a pinhole view
     #[arg(long, conflicts_with = "fov")]
     equirect: bool,
-    /// Render only what lies in a box in the world: x y z of the lower corner, then of the upper corner, meters
+    /// Render only the part of the scene in this box: x y z of the lower corner, then of the upper corner, world frame,
+    /// meters
     #[arg(long, value_name = "NUMBERS", allow_hyphen_values = true, value_parser = corners)]
     crop: Option<Numbers<6>>,
     /// Also write depth as .npy: meters along the camera's z axis (distance with --equirect)
@@ -55,7 +56,7 @@ pub(crate) struct Args {
     json: bool,
 }
 
-/// A fixed number of numbers in one argument.
+/// An argument that consists of `N` numbers.
 #[derive(Clone, Copy, Debug)]
 struct Numbers<const N: usize>([f64; N]);
 

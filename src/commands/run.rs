@@ -45,13 +45,14 @@ pub(crate) struct Args {
     /// Simulate all devices of the rig file
     #[arg(long, conflicts_with = "from")]
     sim: bool,
-    /// Make the simulation wait for the trainer, so that with --steps a seed gives one result [default: real time]
+    /// Make the simulation wait for the trainer, so that with --steps the result depends only on the seed [default:
+    /// real time]
     #[arg(long, requires = "sim", conflicts_with = "from")]
     lockstep: bool,
     /// Replay a recording instead of live devices
     #[arg(long, value_name = "RECORDING")]
     from: Option<PathBuf>,
-    /// Play the recording at the speed of its devices, instead of as fast as it is used: keyframes are taken as they
+    /// Play the recording at the speed of its devices instead of waiting for the trainer. Keyframes are taken as they
     /// arrive, and images that come too fast are dropped
     #[arg(long, requires = "from", conflicts_with = "steps_per_keyframe")]
     real_time: bool,
@@ -67,7 +68,7 @@ pub(crate) struct Args {
     #[arg(long, value_name = "S", allow_negative_numbers = true, value_parser = number_in_range(0.0..=1e9))]
     seconds: Option<f64>,
     /// Stop after N optimizer steps, or when the devices have ended and all data is fused; steps before --resume count.
-    /// With --lockstep, a seed then gives one result
+    /// With --lockstep, the result then depends only on the seed
     #[arg(long, value_name = "N")]
     steps: Option<u64>,
     /// Optimizer steps between two keyframes; needs --lockstep or --from [default: 10]
@@ -114,7 +115,7 @@ const SIM: &str = "sim";
 const LOCKSTEP: &str = "lockstep";
 const RECORD: &str = "record";
 
-/// How long the server stays up so that connected clients receive the last status.
+/// Time for which the server stays up, so that connected clients receive the last status.
 const FINAL_STATUS_TIME: Duration = Duration::from_millis(400);
 /// Steps between two keyframes if the flag is not given.
 const DEFAULT_STEPS_PER_KEYFRAME: u64 = 10;
@@ -130,7 +131,7 @@ struct RunDetails {
     evicted: u64,
     rejected: BTreeMap<&'static str, u64>,
     device_skipped: u64,
-    /// Number of range scans, which are stored in addition to the keyframes, and of their points.
+    /// Number of range scans, which are stored in addition to the keyframes, and number of their points.
     range_scans: usize,
     range_points: usize,
     data_losses: Vec<String>,
@@ -167,7 +168,7 @@ fn drive(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
             Ok(true) => {}
             Ok(false) => match running.live.wait() {
                 Ok(false) => break Ok(()),
-                Ok(true) => {} // The restored model may have fewer steps.
+                Ok(true) => {} // The model was restored and may have fewer steps.
                 Err(error) => break Err(error),
             },
             Err(error) => break Err(error),
@@ -219,7 +220,7 @@ fn publish_end(hub: &Hub, models: &[FinishedModel]) {
         seconds: models.iter().map(|model| model.seconds).fold(0.0, f64::max),
     });
     if hub.n_clients() > 0 {
-        std::thread::sleep(FINAL_STATUS_TIME); // Clients show it even after the server has stopped.
+        std::thread::sleep(FINAL_STATUS_TIME); // Clients keep showing the result after the server has stopped.
     }
 }
 
@@ -249,7 +250,7 @@ impl Running {
     pub(super) fn discard(self) -> anyhow::Result<Option<drivers::Error>> {
         self.stop.request();
         let (mut sessions, input_result) = self.live.finish();
-        // Checkpoints in progress are written into folders that the caller may remove.
+        // The caller may remove the folders, so checkpoints in progress must finish first.
         sessions.iter_mut().for_each(Session::wait_for_checkpoint);
         Ok(input_result?.input_error)
     }
@@ -372,7 +373,7 @@ pub(super) fn start(
     Ok(Running { live, gpu, server, stop, rig, folders, damage })
 }
 
-/// Closes the recording and writes the keyframe lists after a GPU failure; returns the error, extended by what was
+/// Closes the recording and writes the keyframe lists after a GPU failure. Returns the error with a note of what was
 /// saved.
 fn keep_input(mut live: Live, folders: &[PathBuf], error: session::Error) -> session::Error {
     let recoverable = live.describe_recoverable();
@@ -412,7 +413,7 @@ fn save(
     let input_result = match input_result {
         Ok(input_result) => input_result,
         Err(error) => {
-            // An error in the input must not cost the models.
+            // Save the models even if the input has failed.
             let details = || serde_json::json!({ "data_losses": [error.to_string()] });
             let ending = |(session, out): (Session, PathBuf)| EndingSession { details: details(), session, out };
             if n_train > 0 {
@@ -421,7 +422,7 @@ fn save(
             return Err(error.into());
         }
     };
-    // A disk that is too full for the lists may still have space for the models.
+    // Errors are returned only at the end: the models may still be saved even if the disk is too full for the lists.
     let list = |(session, folder): (&Session, &PathBuf)| {
         run_folder::write_keyframe_list(&folder.join("keyframes.txt"), session.keyframes())
     };
@@ -433,7 +434,7 @@ fn save(
     } else {
         SampleUse::ProcessedOnly
     });
-    // Keyframes that are missing from the recording cannot be scored on it later.
+    // An incomplete recording cannot be used to score the model later.
     let is_recorded = input_result.recording_error.is_none();
     data_losses.extend(input_result.recording_error.map(|error| format!("the recording is incomplete: {error:#}")));
     data_losses.extend(damage.get().cloned());
@@ -504,7 +505,7 @@ impl PreviousRun {
         Ok(Self { folder: folder.to_owned(), checkpoint, keyframes })
     }
 
-    /// The rig file settings that were set by flags of that run.
+    /// Rig file settings that flags of that run have changed.
     fn overrides(&self) -> Vec<Override> {
         let realign = self.checkpoint.flags.get(REALIGN).map(|is_on| Override::new(REALIGN, is_on == "true"));
         let method =
@@ -544,7 +545,7 @@ impl Args {
         flags.chain(self.checkpoints.options().flag()).collect()
     }
 
-    /// These flags, with missing ones taken from the previous run.
+    /// Returns these flags; missing ones are taken from the previous run.
     fn with_flags_of(&self, previous: &PreviousRun) -> Self {
         let flag = |name: &str| previous.checkpoint.flags.get(name);
         let has_limit = self.seconds.is_some() || self.steps.is_some();
@@ -578,8 +579,8 @@ impl Args {
             print::report_json(&serde_json::json!({ "event": "finished", "seconds": seconds, "out": folder }))?;
         } else {
             print::report(format_args!(
-                "nothing left to do: the run in {} is finished ({seconds:.1} s) and its model is saved there; a larger --steps or \
-                 --seconds continues it",
+                "nothing left to do: the run in {} is finished ({seconds:.1} s) and its model is saved there; \
+                 to continue it, use a larger --steps or --seconds",
                 folder.display()
             ));
         }
@@ -622,7 +623,7 @@ impl Args {
         }
     }
 
-    /// The input, initialized with the keyframes of the previous run, and those of its keyframes that exceed the memory
+    /// Opens the input and restores the keyframes of the previous run. Also returns keyframes that exceed the memory
     /// limit.
     fn input(
         &self,
@@ -663,7 +664,7 @@ impl Args {
     }
 }
 
-/// Why a run ended without a model, as one sentence.
+/// A sentence that explains why a run ended without a model.
 fn no_model_reason(n_keyframes: usize, counts: &Counts, rig: &Rig) -> String {
     let quoted = |names: Vec<&str>| names.iter().map(|name| format!("{name:?}")).collect::<Vec<_>>().join(", ");
     let expected = quoted(rig.cameras.iter().map(|camera| &*camera.name).collect());

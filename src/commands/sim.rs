@@ -16,14 +16,14 @@ pub(crate) struct Args {
     /// [default: sim-NAME]
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
-    /// Length of the playback in seconds; then devices stand still until Ctrl-C. A 640x480 RGB-D camera at 15 Hz writes
-    /// 60 MB per second into the folder
+    /// Length of the playback in seconds; after it, devices stand still until Ctrl-C. A 640x480 RGB-D camera at 15 Hz
+    /// writes 60 MB per second into the folder
     #[arg(long, value_name = "S", default_value_t = 60.0, value_parser = number_in_range(0.1..=86_400.0))]
     seconds: f64,
     /// Play back this recording of the same rig instead of a simulation
     #[arg(long, value_name = "REC.mcap")]
     from: Option<PathBuf>,
-    /// Seconds from ready to the start of the playback, to start the other program
+    /// Delay before the playback starts, seconds; time to start the other program
     #[arg(long, value_name = "S", default_value_t = 10.0, value_parser = number_in_range(0.1..=86_400.0))]
     start_in: f64,
     /// Version of FCI that the emulated Franka controller uses: 5 (Panda) or 10 (FR3)
@@ -44,8 +44,8 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
 #[cfg(not(all(feature = "sim", feature = "realsense", target_os = "linux")))]
 pub(crate) fn run(_args: &Args) -> anyhow::Result<Exit> {
     anyhow::bail!(
-        "this program was built without the simulator or without RealSense support, which it needs to emulate cameras: install the RealSense SDK, or \
-         run scripts/fetch-realsense.sh, and build on Linux with `cargo build --release --features sim,realsense`"
+        "this program was built without the simulator or without RealSense support, and `fieldrig sim` needs both: install the RealSense SDK or \
+         run scripts/fetch-realsense.sh, then build on Linux with `cargo build --release --features sim,realsense`"
     )
 }
 

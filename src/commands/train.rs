@@ -48,16 +48,16 @@ pub(crate) struct Args {
     /// larger --steps or --seconds continues a finished run; model settings cannot be changed
     #[arg(long, value_name = "FOLDER", conflicts_with_all = ["method", "seed", "max_bytes", "max_splats", "refine", "count", "plan_steps"])]
     resume: Option<PathBuf>,
-    /// Repeat the timing-dependent decisions of an earlier run and get the same model. Takes the run's decisions.jsonl
-    /// and needs its data
+    /// Repeat the timing-dependent decisions in this decisions.jsonl of an earlier run. With the same data, this gives
+    /// the same model
     #[arg(long, value_name = "FILE", conflicts_with_all = ["method", "seed", "max_bytes", "max_splats", "refine", "count", "plan_steps", "seconds", "steps", "holdout", "keyframes", "scale"])]
     replay_decisions: Option<PathBuf>,
     /// Stop after S seconds of training; loading and scoring do not count, time before --resume does
     /// [default: 120, unless --steps is given]
     #[arg(long, value_name = "S", allow_negative_numbers = true)]
     seconds: Option<f64>,
-    /// Stop after N optimizer steps; steps before --resume count. Without --seconds, no decision depends on timing, so
-    /// one seed gives one result
+    /// Stop after N optimizer steps; steps before --resume count. Without --seconds, no decision depends on timing, and
+    /// the result depends only on the seed
     #[arg(long, value_name = "N")]
     steps: Option<u64>,
     /// Steps over which the learning rate decays and the model grows [default: --steps, else 7000]
@@ -65,8 +65,8 @@ pub(crate) struct Args {
     plan_steps: Option<u64>,
     #[command(flatten)]
     images: DataArgs,
-    /// Render this model (a folder, or a splat file) to get depth for images that have none, or have it on less than
-    /// half of their pixels. All methods treat it as measured. The model must be of the same scene, in the same world
+    /// Render depth from this model (a folder or a splat file) for images that have depth on less than half of their
+    /// pixels. All methods treat rendered depth as measured. The model must be of the same scene, in the same world
     /// frame. --refine then estimates parameters jointly with the scene
     #[arg(long, value_name = "MODEL")]
     depth_from: Option<PathBuf>,
@@ -104,7 +104,7 @@ struct TrainDetails<'a> {
     data_losses: &'a [String],
     /// Estimated base pose at each station after the first.
     stations: &'a [StationReport],
-    /// How much depth was rendered from a model.
+    /// Amount of depth that was rendered from a model.
     #[serde(skip_serializing_if = "Option::is_none")]
     rendered_depth: Option<&'a RenderedDepth>,
     /// Calibration parameters estimated by registering images.
@@ -196,7 +196,7 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
     }
     let mut models = args.models(&gpu, &data, replay.as_ref(), checkpoint.as_ref())?;
     let from_step = checkpoint.is_some().then(|| models[0].method.n_total_steps()).transpose()?;
-    // The limit does not count steps of rejected trials and steps before a restart.
+    // Like the limit, `step` excludes steps of rejected trials and steps before a restart.
     let step = models[0].method.progress().step;
     if let (Some(steps), Some(subject)) = (given_steps, &subject)
         && steps < step
@@ -217,7 +217,7 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
         DataSource { path: Some(args.data.clone()), flags: images.flags_of_images(), image_names: data.image_names() };
     let run_flags = RunFlags { depth_from: depth_model_sha256.map(str::to_owned), flags };
 
-    let untrained = models[0].untrained.clone(); // All models start with the same images; only a single model resumes from a checkpoint.
+    let untrained = models[0].untrained.clone(); // A resumed run has one model; several new models start with the same images.
     let is_untrained = |keyframe: &Arc<Keyframe>| untrained.iter().any(|other| Arc::ptr_eq(other, keyframe));
     let clock = Clock::default();
     let (mut sessions, mut seeds) = (Vec::new(), Vec::new());
@@ -253,7 +253,7 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
             .with_profile(args.profile)
             .with_decisions(decisions)
             .with_data(source.clone());
-        // A replay runs on one device, because its log counts steps.
+        // A replay is not restarted after a GPU failure, because its log refers to step numbers.
         let session = if replay.is_none() { session.with_recovery(recovery) } else { session };
         sessions.push(match (&kinds[..], &checkpoint) {
             ([_], Some(checkpoint)) => session.with_elapsed_secs(checkpoint.seconds),
@@ -261,7 +261,7 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
             _ => session.with_shared_clock(clock.clone()),
         });
     }
-    // Aligning base stations and rendering depth count only once, in the first run.
+    // Time for aligning base stations and rendering depth counts only in the first run.
     let preparation_time = if checkpoint.is_some() { Duration::ZERO } else { data.preparation_time };
     match &replay {
         Some(replay) => replay.drive(&mut sessions[0], &untrained, &stop)?,
@@ -358,7 +358,7 @@ impl Args {
         flags.chain(self.checkpoints.options().flag()).collect()
     }
 
-    /// These flags, with missing ones taken from the previous run.
+    /// Returns these flags; missing ones are taken from the previous run.
     fn with_flags_of(&self, checkpoint: &Checkpoint) -> Self {
         let flag = |name: &str| checkpoint.flags.get(name);
         let path = |name: &str| flag(name).map(PathBuf::from);
@@ -382,7 +382,7 @@ impl Args {
         format!("fieldrig train {data} --resume {folder}")
     }
 
-    /// Whether the previous run reached its limit and saved its model, and no flag asks for more.
+    /// Whether the previous run reached its limit and saved its model, and no flag raises the limit.
     fn is_finished(&self, checkpoint: &Checkpoint) -> bool {
         let asks_for_more = self.seconds.is_some()
             || self.steps.is_some()
@@ -401,8 +401,8 @@ impl Args {
             print::report_json(&serde_json::json!({ "event": "finished", "seconds": seconds, "out": folder }))?;
         } else {
             print::report(format_args!(
-                "nothing left to do: the run in {} is finished ({limits}, {:.1} s) and its model is saved there; a larger --steps or \
-                 --seconds continues it",
+                "nothing left to do: the run in {} is finished ({limits}, {:.1} s) and its model is saved there; \
+                 to continue it, use a larger --steps or --seconds",
                 folder.display(),
                 checkpoint.seconds
             ));
@@ -416,7 +416,7 @@ impl Args {
         self.out.as_deref().or_else(unfinished)
     }
 
-    /// Logs differences from an uninterrupted run.
+    /// Logs in which ways the resumed run differs from an uninterrupted one.
     fn resumed(&self, resumed: Resumed) -> Resumed {
         let (planned, step) = (resumed.model_spec.options.common.n_planned_steps, resumed.method.progress().step);
         log::info!("continuing from step {step} of {planned} planned steps");

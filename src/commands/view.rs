@@ -119,7 +119,7 @@ fn start_server(listen: Option<SocketAddr>, hub: &Hub) -> Result<Server, viz::Er
     }
 }
 
-/// Rejects paths that are often mistaken for a model, and names the command to use instead.
+/// Rejects paths that are often mistaken for a model. The error names the command to use instead.
 fn check_is_model(model: &Path) -> Result<(), BadArgument> {
     let shown = model.display();
     let is_url = |scheme: &str| model.to_str().is_some_and(|text| text.starts_with(scheme));

@@ -1,9 +1,9 @@
-//! Location of real data that some tests compare with. Tests are skipped, with a message, if it is missing.
+//! Location of real data that some tests use. Without the data, these tests are skipped with a message.
 
 use std::path::{Path, PathBuf};
 
-/// A folder of the test data, in `FIELDRIG_TEST_DATA` or next to the project. If it is missing, prints a message and
-/// returns `None`.
+/// A folder of the test data, in `FIELDRIG_TEST_DATA` or next to the project. If the folder is missing, prints a
+/// message and returns `None`.
 pub(crate) fn folder(name: &str) -> Option<PathBuf> {
     let default_folder = || {
         // The crate's folder is the project folder or a folder in it.

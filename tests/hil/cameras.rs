@@ -1,7 +1,7 @@
 //! Tests of the V4L2 driver against vivid, inside the virtual kernel. There are two devices: `vivid-000` is a webcam,
 //! `vivid-001` a television grabber.
 //!
-//! vivid has no exposure control and no MJPEG. Unit tests cover those.
+//! vivid has no exposure control and no MJPEG; unit tests cover both.
 
 use drivers::v4l2::{self, Config, Delivery, Settings, V4l2Camera, V4l2Format};
 use drivers::{Camera, CameraCounts, Error, Image};
@@ -14,18 +14,18 @@ use std::time::{Duration, Instant};
 
 pub(crate) const WEBCAM: &str = "platform:vivid-000";
 const GRABBER: &str = "platform:vivid-001";
-/// Controls of vivid that inject faults (`vivid-ctrls.c`): percentage of images to drop; disconnection.
+/// Fault injection controls of vivid (`vivid-ctrls.c`): drop a percentage of the images; disconnect.
 pub(crate) const DROP_PERCENT: u32 = 0x00f0_f040;
 const DISCONNECT: u32 = 0x00f0_f041;
-/// The next image is damaged; the next stream does not start; the running stream fails.
+/// More fault injection controls: damage the next image; reject the next stream; break the running stream.
 const DAMAGE: u32 = 0x00f0_f042;
 const REFUSE_STREAM: u32 = 0x00f0_f045;
 const BREAK_STREAM: u32 = 0x00f0_f046;
-/// Drift of stamps relative to sequence numbers, in periods, that is possible without a miscount, which would change it
-/// by a whole period. vivid stamps images with a delay: 0 to 0.25 periods on an idle machine, up to 0.75 with twice as
-/// many busy processes as cores.
+/// Drift of the stamps relative to the sequence numbers, in periods, that may occur without a miscount. A miscount
+/// changes the drift by a whole period. vivid stamps images late: by 0 to 0.25 periods on an idle machine, and by up to
+/// 0.75 with twice as many busy processes as cores.
 const DRIFT_RANGE: std::ops::Range<f64> = -0.7..0.95;
-/// Kernel ids of gain and brightness, and values that are not the defaults.
+/// V4L2 ids of gain and brightness, and values other than the defaults.
 const GAIN: u32 = 0x0098_0913;
 const BRIGHTNESS: u32 = 0x0098_0900;
 const SETTINGS: Settings =
@@ -77,8 +77,8 @@ impl CapturedImages {
         Self { images, elapsed: start_time.elapsed() }
     }
 
-    /// Returns the number of delivered and of lost images after the first one, and checks them against the stamps,
-    /// which are independent of the sequence numbers.
+    /// Returns the numbers of delivered and lost images after the first one. Checks them against the stamps, which are
+    /// independent of the sequence numbers.
     fn report(&self, what: &str, rate_hz: f64) -> (u64, u64) {
         let first = self.images[0].stamp;
         let mut number = 0;
@@ -159,7 +159,7 @@ pub(crate) fn write_driver_action(action: &str) {
 
 #[test]
 #[ignore = "runs in the virtual kernel"]
-fn unplugging_is_survived_with_all_settings() {
+fn unplugged_camera_reconnects_with_all_settings() {
     let rate_hz = 25.0;
     let mut camera =
         V4l2Camera::open(Config { settings: SETTINGS, ..config(WEBCAM, [640, 360], rate_hz) }).expect("vivid opens");
@@ -196,7 +196,7 @@ fn unplugging_is_survived_with_all_settings() {
     write_driver_action("unbind");
     let unplugged_at = Instant::now();
     while !matches!(camera.next_image(Duration::from_millis(50)), Err(Error::Reconnecting { .. })) {
-        assert!(unplugged_at.elapsed() < Duration::from_secs(2), "the driver does not notice");
+        assert!(unplugged_at.elapsed() < Duration::from_secs(2), "the driver did not detect the outage");
     }
     std::thread::sleep(Duration::from_secs(1).saturating_sub(unplugged_at.elapsed()));
     write_driver_action("bind");
@@ -211,7 +211,7 @@ fn unplugging_is_survived_with_all_settings() {
 
 #[test]
 #[ignore = "runs in the virtual kernel"]
-fn camera_that_stays_away_is_an_error_after_timeout() {
+fn missing_camera_is_an_error_after_timeout() {
     let wait = Duration::from_secs(1);
     let mut camera =
         V4l2Camera::open(Config { reconnect_for: wait, ..config(WEBCAM, [320, 180], 25.0) }).expect("vivid opens");
@@ -221,7 +221,7 @@ fn camera_that_stays_away_is_an_error_after_timeout() {
     let error = loop {
         match camera.next_image(Duration::from_millis(100)) {
             Ok(_) | Err(Error::Reconnecting { .. }) => {
-                assert!(start_time.elapsed() < 5 * wait, "the camera is not given up")
+                assert!(start_time.elapsed() < 5 * wait, "the driver did not give up")
             }
             Err(error) => break error.to_string(),
         }
@@ -241,7 +241,7 @@ fn silent_camera_is_restarted_and_then_given_up() {
     CapturedImages::capture(&mut camera, 0.2);
     let set_drop_percent =
         |percent| v4l2::set_control(&node(WEBCAM), DROP_PERCENT, percent).expect("vivid injects faults");
-    // Silent for three seconds: restarted after two, then it recovers.
+    // If the camera is silent for three seconds, the driver restarts it after two, and it recovers.
     set_drop_percent(100);
     let start_time = Instant::now();
     while start_time.elapsed() < Duration::from_secs(3) {
@@ -253,7 +253,7 @@ fn silent_camera_is_restarted_and_then_given_up() {
     println!("silent for 3 s: restarted {} times, {} images lost", camera.counts().n_reconnections, image.n_skipped);
     assert_eq!(camera.counts().n_reconnections, 1);
     assert!((70..=100).contains(&image.n_skipped), "{} images lost in 3 s at 25 Hz", image.n_skipped);
-    // Silent forever: reopened repeatedly, then given up.
+    // If the camera stays silent, the driver reopens it repeatedly and then gives up.
     set_drop_percent(100);
     let start_time = Instant::now();
     let error = loop {
@@ -318,7 +318,7 @@ fn all_formats_show_the_same_picture() {
         let got = bars(&picture(format));
         let max_difference = expected.iter().zip(&got).map(|(a, b)| a.abs_diff(*b)).max();
         println!("{}: maximum difference {max_difference:?} of 255", format.name());
-        // Rounding errors of the conversion to a limited range and back.
+        // Covers rounding errors of the conversion to limited range and back.
         assert!(max_difference <= Some(3), "{}: {expected:?}, got {got:?}", format.name());
     }
     let gray = bars(&picture(Grey));
@@ -369,7 +369,7 @@ fn images_before_first_read_are_not_counted_as_lost() {
 
 #[test]
 #[ignore = "runs in the virtual kernel"]
-fn unsupported_modes_report_supported_ones() {
+fn unsupported_mode_error_lists_supported_modes() {
     let open_error = |config| V4l2Camera::open(config).expect_err("vivid does not support this").to_string();
     let size = open_error(config(WEBCAM, [800, 600], 25.0));
     println!("{size}");

@@ -1,6 +1,6 @@
 //! Tests of CAN buses and arms inside the virtual kernel. The motors are emulated on the same virtual bus
-//! (`drivers::can::emulated`). A virtual bus has no bit timing, so bit rates, error states and bus-off are not tested
-//! here.
+//! (`drivers::can::emulated`). A virtual bus has no bit timing, so these tests do not cover bit rates, error states and
+//! bus-off.
 
 use drivers::can::cia402::{Cia402, Units};
 use drivers::can::damiao::Damiao;
@@ -21,7 +21,7 @@ use std::thread::JoinHandle;
 use std::time::Duration;
 
 pub(crate) const DAMIAO_LIMITS: Limits = Limits::of(12.5, 30.0, 10.0);
-/// A motor that answers only commands.
+/// A motor that replies only to commands.
 const AK: TMotor = TMotor { motor: 6, model: tmotor::Model::Ak80x9 };
 const UNITS: Units = Units { counts_per_turn: 65_536.0, rated_torque_nm: 10.0 };
 /// Amplitude (rad) and angular frequency (rad/s) of the joint motion.
@@ -81,7 +81,7 @@ pub(crate) struct Bench {
 }
 
 impl Bench {
-    /// `commands`: frames that another master sends in each cycle.
+    /// `commands` are frames that another master sends in each cycle.
     pub(crate) fn new(bus: BusConfig, motors: Vec<MotorConfig>, commands: Vec<Frame>) -> Self {
         let [stop, is_swinging] = [false; 2].map(|now| Arc::new(AtomicBool::new(now)));
         let bus = Bus::open(&bus).expect("the bus is up");
@@ -90,7 +90,7 @@ impl Bench {
             let mut emulated: Vec<EmulatedMotor> =
                 motors.iter().map(|motor| EmulatedMotor::new(&*motor.protocol, DAMIAO_LIMITS)).collect();
             while !stop_flag.load(Ordering::Relaxed) {
-                // Ends when the bus is taken down.
+                // The thread ends when the bus is taken down.
                 let Ok(arrived) = bus.receive(Duration::from_millis(2)) else { return };
                 let now = clock::now();
                 let mut sent = Vec::new();
@@ -219,7 +219,7 @@ fn joints_are_read_from_motors_of_all_families() {
     let config = ArmConfig { buses: vec![wire.config(false)], motors: motors.clone(), rate_hz: 200.0 };
     let mut arm = CanArm::open(&config).expect("all motors answer");
     assert_eq!(arm.joint_names(), motors.iter().map(|motor| motor.joint.clone()).collect::<Vec<_>>());
-    // Half a count of position, plus half a count of velocity times a few milliseconds of extrapolation.
+    // Half a count of velocity, times a few milliseconds of extrapolation.
     const EXTRAPOLATED_RAD: f64 = 1e-4;
     let half_counts = [12.5 / 65_535.0, 12.5 / 65_535.0, 12.57 / 65_535.0, 1e-6, 4.8e-5, 12.5 / 65_535.0];
     // On a busy machine, individual states are extrapolated over a longer time.

@@ -1,6 +1,6 @@
-//! Tests that move arms on CAN buses, interrupt the connection, and recover, inside the virtual kernel. The motors are
-//! emulated, including their shafts and watchdogs. The faults are real: a process is killed or stopped, a link is down,
-//! a cable is disconnected.
+//! Tests inside the virtual kernel that move arms on CAN buses, interrupt the connection, and recover. The motors are
+//! emulated, including their shafts and watchdogs. The tests kill or suspend a process, take a link down, or disconnect
+//! the emulated cable.
 
 use crate::can::{DAMIAO_LIMITS, Wire, all_families, damiao, ip, motor};
 use drivers::can::cia402::{Cia402, Units};
@@ -22,14 +22,15 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-/// Environment variable with a bus name. If it is set, this program moves the arm on that bus until it is killed.
+/// Environment variable with a bus name. If it is set, this program moves the arm on that bus until the process is
+/// killed.
 const CHILD: &str = "FIELDRIG_HIL_CHILD";
 const RATE_HZ: f64 = 200.0;
 /// Longer than the delays of a busy machine without a real-time kernel, which may be tens of milliseconds.
 const TIMEOUT: Duration = Duration::from_millis(250);
-/// Tolerance of the stop time of an emulated motor, in addition to stalls of its thread.
+/// Tolerance for the stop time of an emulated motor, in addition to stalls of its thread.
 const STOP_TOLERANCE: Duration = Duration::from_millis(30);
-/// Tolerance of the time at which the arm reports a stop on a busy machine.
+/// Tolerance for the time until the arm reports a stop on a busy machine.
 const REPORT_TOLERANCE: Duration = Duration::from_millis(300);
 const LIMITS: MotionLimits = MotionLimits { position: [-2.0, 2.0], velocity: 1.0, acceleration: 2.0, jerk: 20.0 };
 const GAINS: Gains = Gains { stiffness_nm_rad: 30.0, damping_nm_s_rad: 1.5 };
@@ -75,7 +76,7 @@ impl Motors {
             }
             let mut before = clock::now();
             while !stop_flag.load(Ordering::Relaxed) {
-                // A link that goes down reports an error once.
+                // Errors are ignored: a link that goes down reports one.
                 let arrived = bus.receive(Duration::from_millis(1)).unwrap_or(None);
                 let now = clock::now();
                 let gap = u64::try_from(now.nanos_since(before)).expect("the clock is monotonic");
@@ -92,7 +93,7 @@ impl Motors {
                     {
                         let before = motor.target();
                         sent.extend(motor.take(frame).expect("the motion is within range"));
-                        // For axes and drives, other frames also reset the watchdog.
+                        // Motors with their own control loop also reset the watchdog on frames that are not commands.
                         let has_own_loop = !config.protocol.family().has_gains();
                         let is_watchdog_reset = motor.watchdog_reset_at() == Some(now) && !has_own_loop;
                         let is_new = motor.target() != before || is_watchdog_reset;
@@ -102,7 +103,7 @@ impl Motors {
                     }
                 }
                 for frame in sent.iter().filter(|_| !disconnected.load(Ordering::Relaxed)) {
-                    let _ = bus.send(frame); // Errors of a link that is down are ignored, as above.
+                    let _ = bus.send(frame); // Errors are ignored, as above.
                 }
                 let state = emulated.iter().zip(&configs).zip(&commanded_rad);
                 *observed_by_thread.lock() = state
@@ -195,7 +196,7 @@ pub(crate) fn movable(bus: BusConfig, motors: &[MotorConfig], on_loss: OnLoss) -
     }
 }
 
-/// Whether it is an AK motor, which has no watchdog.
+/// Whether this is an AK motor, which has no watchdog.
 fn is_ak(motor: &MotorConfig) -> bool {
     motor.protocol.family().name() == "tmotor"
 }
@@ -251,8 +252,9 @@ fn motors_of_all_families_reach_targets() {
     assert_eq!(arm.motion(), Motion::Holding);
     // The motors start at 0, which is another joint position for some. Enabling them must not cause motion.
     let initial: Vec<f64> = configs.iter().map(|config| config.offset_rad).collect();
-    // Resolution: half a count in the command and half in the feedback; drives and ODrives are more precise. In MIT
-    // mode, no count represents zero velocity: half a count displaces a motor by the ratio of damping to stiffness.
+    // Resolution: half a count in the command and half a count in the feedback; drives and ODrives are more precise. In
+    // MIT mode, no count represents zero velocity. The offset of half a count, times damping over stiffness, displaces
+    // the motor.
     let push_offset =
         |limit_rad_s: f64, counts: f64| limit_rad_s / counts * GAINS.damping_nm_s_rad / GAINS.stiffness_nm_rad;
     let counts = [
@@ -273,7 +275,7 @@ fn motors_of_all_families_reach_targets() {
         let target = JointTarget { position: target };
         assert_eq!(arm.command(&target).expect("within the limits"), target);
         wait_until_holding(&mut arm);
-        // Extrapolation by half a count of velocity until the other motors have reported.
+        // Error of half a count of velocity, extrapolated until the other motors have reported.
         const EXTRAPOLATED_RAD: f64 = 1e-4;
         let mut reported = [f64::INFINITY; 6];
         for _ in 0..50 {
@@ -302,7 +304,7 @@ fn motors_of_all_families_reach_targets() {
 
 #[test]
 #[ignore = "needs the virtual kernel"]
-fn motors_without_watchdog_get_fail_safe_resent() {
+fn fail_safe_command_is_resent_to_motors_without_watchdog() {
     let wire = Wire::new("vcan13", false);
     let configs: Vec<_> = all_families().into_iter().filter(is_ak).collect();
     // The cable is disconnected while the program shuts down, or while the arm is open. No frames arrive until it is
@@ -447,7 +449,7 @@ fn faults_stop_the_arm_until_recovery() {
                 "the bus is off" => inject_bus_off("vcan10"),
                 _ => motors.fails_next.store(true, Ordering::Relaxed),
             }
-            // The command that takes the link down takes some time; the link is down now.
+            // Measure from here, because taking the link down takes some time.
             let faulted_at = clock::now();
             let reason = wait_until_stopped(&arm);
             let reported_after = clock::now().duration_since(start_time);
@@ -482,7 +484,7 @@ fn faults_stop_the_arm_until_recovery() {
                 motors.observed().iter().map(|observed| observed.commanded_rad.len()).sum::<usize>(),
                 n_commands
             );
-            // Released motors coast. They must stay within the range of the joints, or recovery reports an error.
+            // Released motors coast. If they leave the range of the joints, recovery reports an error.
             let coasted: Vec<f64> = motors.positions();
             match arm.recover() {
                 Ok(()) => {
@@ -507,7 +509,7 @@ fn malformed_frames_at_worst_stop_the_arm() {
         MovableCanArm::open(&movable(wire.config(false), &configs, OnLoss::Release)).expect("the motors are enabled");
     arm.command(&JointTarget { position: vec![1.0; configs.len()] }).expect("within the limits");
     let noise = Bus::open(&wire.config(false)).expect("the bus is up");
-    // Ids of the answers of each motor and of its other frames: feedback, PDOs, SDO answers, heartbeats.
+    // Ids of all frames that the motors send: replies, feedback, PDOs, SDO replies, heartbeats.
     let ids = [Id::standard(0x11), Id::extended(0x0280_03FD), Id::extended(0x1100_03FD), Id::standard(0x081)]
         .into_iter()
         .chain([0x089, 0x085, 0x185, 0x285, 0x585, 0x705].map(Id::standard))
@@ -544,8 +546,8 @@ fn inject_bus_off(interface: &str) {
         .expect("the bus is up");
 }
 
-/// Program that moves an arm until it is killed: this program, with the environment variable for a bus. It recovers
-/// after reading a line from stdin.
+/// Moves an arm until the process is killed. Another test starts this program with the bus in an environment variable.
+/// After a stop, it recovers when it reads a line from stdin.
 #[test]
 #[ignore = "started by another test"]
 fn child_program_moves_arm() {

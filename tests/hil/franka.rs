@@ -31,7 +31,7 @@ fn libfranka_moves_emulated_robot_and_recovers_from_reflex() {
     const REST_RAD: [f64; N_JOINTS] = [0.1, -0.5, 0.2, -2.0, 0.3, 1.8, 0.7];
     let _alone = ONE_AT_A_TIME.lock();
     let Some(python) = environment() else { return };
-    // libfranka always connects to port 1337, so use a loopback address that no other process uses.
+    // libfranka always connects to port 1337, so each test process uses its own loopback address.
     let [_, _, high, low] = std::process::id().to_be_bytes();
     let ip = Ipv4Addr::new(127, 37, high, low.clamp(1, 254));
     let config = RobotConfig {
@@ -120,7 +120,7 @@ fn motion() -> MotionConfig {
     }
 }
 
-/// Moves back and forth until 10 000 states were answered, and checks the statistics on both sides.
+/// Moves back and forth for 10 000 cycles, and checks the statistics on both sides.
 ///
 /// On a busy machine, up to three attempts are made. A reflex caused by a violated limit fails immediately.
 fn follow_for_ten_thousand_cycles(name: &str, open: impl Fn() -> MovableFrankaArm) {
@@ -163,7 +163,7 @@ fn follow_for_ten_thousand_cycles(name: &str, open: impl Fn() -> MovableFrankaAr
     }
 }
 
-/// Joint positions after the arm has come to rest, skipping queued older states.
+/// Joint positions after the arm has come to rest. Skips older states in the queue.
 fn settled_position(arm: &mut MovableFrankaArm) -> Vec<f64> {
     std::thread::sleep(Duration::from_millis(100));
     let mut position = arm.read(TEST_TIMEOUT).expect("the arm reports its joints").position;
@@ -184,7 +184,7 @@ impl FrankaSim {
         let port =
             TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).expect("a free port").local_addr().expect("a free port").port();
         let log = fs::File::create(folder().join("franka-sim.log")).expect("creating the log file");
-        // The model of franka-sim is a separate download; ours uses primitive shapes.
+        // The model of franka-sim is a separate download, so this uses our model of primitive shapes.
         let (root, model) = (Path::new(env!("CARGO_MANIFEST_DIR")).join(".."), folder().join("panda.xml"));
         let model_output = Command::new(python)
             .arg(root.join("tests/hil/franka_sim_model.py"))
@@ -204,8 +204,8 @@ impl FrankaSim {
         Self { address: SocketAddr::from((Ipv4Addr::LOCALHOST, port)).to_string(), _process: KillOnDrop(child) }
     }
 
-    /// Configuration for franka-sim, which reports the pose of its seventh link as flange
-    /// pose. The real flange is 107 mm further.
+    /// Configuration for franka-sim, which reports the pose of its seventh link as the flange pose. The real flange is
+    /// 107 mm further along the axis.
     fn config(&self) -> ArmConfig {
         let chain = chain("panda_link7");
         ArmConfig { address: self.address.clone(), joint_names: chain.joint_names().to_vec(), chain }
@@ -309,8 +309,7 @@ fn make_environment() -> Result<(), String> {
     fs::write(complete_marker, "").map_err(|error| error.to_string())
 }
 
-/// Folder of the virtual environment, named after its contents, next to the other virtual hardware in the target
-/// folder.
+/// Folder of the virtual environment in the target folder. Its name depends on the pinned wheels.
 fn folder() -> PathBuf {
     let shas: String = pins().map(|[sha256, ..]| &sha256[..4]).collect();
     Path::new(env!("CARGO_TARGET_TMPDIR")).join("../hil").join(format!("franka-{shas}"))

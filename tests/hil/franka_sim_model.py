@@ -1,4 +1,4 @@
-"""Writes a model for franka-sim that is stable under stiff control: a URDF plus the inertia of rotors behind gears.
+"""Writes a model for franka-sim that is stable under stiff control: adds the inertia of the geared rotors to a URDF.
 
 usage: franka_sim_model.py URDF MJCF      reads URDF, writes MJCF
 """
@@ -7,7 +7,7 @@ import sys
 
 import mujoco
 
-ROTORS_KG_M2 = 0.6  # Without it, the damping of 450 Nm s/rad makes steps of one millisecond unstable.
+ROTORS_KG_M2 = 0.6  # Without this inertia, a damping of 450 Nm s/rad is unstable with steps of one millisecond.
 
 
 def main():

@@ -1,6 +1,6 @@
 //! Tests of CAN on real drivers, inside a machine emulated by QEMU with two CAN cards on one bus. Bit rates, controller
-//! states and bus-off behave like those of real interfaces. Errors that QEMU's chips cannot produce are injected from
-//! outside (`qemu.rs`).
+//! states and bus-off behave as on real interfaces. Errors that QEMU's chips cannot produce are injected from outside
+//! (`qemu.rs`).
 
 use super::can::{Bench, damiao};
 use super::can_motion::{Motors, movable, wait_until_stopped};
@@ -16,7 +16,7 @@ use std::path::PathBuf;
 use std::process::Command;
 use std::time::Duration;
 
-// Bits of status and interrupt registers of the chip for errors (SJA1000 data sheet of 2000, section 6.4).
+// Error bits in the status and interrupt registers of the chip (SJA1000 data sheet of 2000, section 6.4).
 const HAS_ERRORS: u8 = 0x40;
 const IS_BUS_OFF: u8 = 0x80;
 const STATUS_CHANGED: u8 = 0x04;
@@ -52,8 +52,8 @@ impl Card {
             fs::write(format!("/sys/bus/pci/drivers/kvaser_pci/{order}"), slot).expect("the driver can be (un)bound");
         }
         let card = Self { interface, device };
-        // Write the interface name, which identifies the chip for fault injection. The acceptance registers are only
-        // writable while it is down; all frames are accepted anyway.
+        // For fault injection, the chip is identified by the interface name in its acceptance registers. They are
+        // writable only while the interface is down. All frames are still accepted.
         for (value, register) in [interface.as_bytes(), &qemu::ACCEPT_ALL].concat().iter().zip(16..) {
             card.write(register, *value);
         }
@@ -67,7 +67,7 @@ impl Card {
         card
     }
 
-    /// A card that is up, but restarts later after bus-off, or never if `restart_millis` is 0.
+    /// A card that is up and restarts `restart_millis` after bus-off, or never if that is 0.
     fn up_with_restart(interface: &'static str, restart_millis: u32) -> Self {
         let card = Self::new(interface);
         sh(&format!("sudo ip link set {interface} up type can bitrate 1000000 restart-ms {restart_millis}"));
@@ -107,7 +107,7 @@ impl Card {
         ports.write_all_at(&control.to_le_bytes(), CONTROL).expect("the register is writable");
     }
 
-    /// Injects status and interrupt bits into the chip. The driver notices them at the next interrupt of the chip.
+    /// Injects status and interrupt bits into the chip. The driver reads them at the next interrupt.
     fn inject(&self, status: u8, interrupts: u8) {
         println!("\n{}{} {status:02x} {interrupts:02x}", qemu::INJECT, self.interface);
         let mut answer = String::new();
@@ -118,7 +118,7 @@ impl Card {
     /// Injects status and interrupt bits and triggers an interrupt.
     fn raise_error(&self, status: u8, interrupts: u8) {
         self.inject(status, interrupts);
-        // Send the command that clears an overrun, although there is none: it makes the chip reevaluate its interrupts.
+        // The command to clear an overrun makes the chip reevaluate its interrupts, even if there is no overrun.
         self.write(1, 0x08);
     }
 
@@ -329,7 +329,7 @@ fn controller_state_changes_are_reported() {
     assert_eq!(link.state, Some(State::BusOff), "{link}");
     let problems = link.problems(&card.config());
     assert!(problems.iter().any(|complaint| complaint.problem.starts_with("it is bus-off")), "{problems:?}");
-    // After the kernel has noticed that nothing is transmitted, which may take a second, it accepts frames and drops
+    // The kernel needs up to a second to detect that nothing is transmitted. After that, it accepts frames and drops
     // them.
     let frame = Frame::classic(Id::standard(0x100).expect("11 bits"), &[]).expect("no bytes");
     std::thread::sleep(Duration::from_millis(1200));
@@ -353,7 +353,7 @@ fn doctor_reports_bus_off_with_working_fix() {
     }
     let printed = doctor();
     assert!(printed.contains("can0: it is bus-off") && printed.contains(&fix_command("can0")), "{printed}");
-    // Clear the injected bits, as a chip does that returns to the bus.
+    // Clear the injected bits, as a chip does when it returns to the bus.
     card.inject(0, 0);
     sh(&fix_command("can0"));
     assert_eq!(card.link().problems(&card.config()), []);
@@ -367,7 +367,8 @@ fn unacknowledged_frames_are_distinguished_from_silence() {
     let config = ArmConfig { buses: vec![card.config()], motors: vec![damiao(1)], rate_hz: 100.0 };
     let printed = CanArm::open(&config).expect_err("no motor is connected").to_string();
     assert!(printed.contains("no answer to 4 requests"), "{printed}");
-    // The chip reports it with the first query. Its driver cannot report frames without acknowledgment.
+    // The chip reports error-passive with the first request. This is the only sign, because its driver cannot report
+    // missing acknowledgments.
     card.inject(HAS_ERRORS, PASSIVE_CHANGED);
     let printed = CanArm::open(&config).expect_err("no motor is connected").to_string();
     assert!(printed.contains("no node acknowledges frames"), "{printed}");

@@ -1,4 +1,4 @@
-"""Client based on libfranka: moves for 2000 cycles, commands a step that triggers a reflex, recovers; prints one JSON object.
+"""A libfranka client: moves for 2000 cycles, commands a step that triggers a reflex, recovers, moves again; prints one JSON object.
 
 usage: libfranka_client.py ADDRESS      libfranka always uses port 1337
 """

@@ -3,8 +3,8 @@
 //! built once.
 //!
 //! The tests in this file run on the host. Each creates a root folder with this program, boots a kernel on it, and
-//! reads its console. Inside, the same program runs the tests of the other files, which are ignored on the host: those
-//! of `kvaser.rs` in QEMU, the others in User-Mode Linux.
+//! reads its console. Inside, the same program runs the tests of the other files, which are ignored on the host:
+//! `kvaser.rs` in QEMU, the others in User-Mode Linux.
 
 #![expect(clippy::print_stdout, reason = "tests report results from the virtual kernel")]
 
@@ -30,7 +30,8 @@ use std::process::{Child, Command, Stdio};
 use std::sync::mpsc::RecvTimeoutError;
 use std::time::Duration;
 
-/// First process of the User-Mode Linux kernel. It prints its exit code to the console, because a kernel has none.
+/// First process in User-Mode Linux. It prints the exit code of the tests to the console, because a kernel has no exit
+/// code.
 const INIT: &str = r#"#!/bin/busybox sh
 bb=/bin/busybox
 $bb mount -t proc proc /proc
@@ -81,8 +82,8 @@ fn can_cards_in_virtual_machine() {
     });
 }
 
-/// Runs tests in the machine whose console output `boot` returns, unless something is missing. `extra_files` are files
-/// that only this machine requires.
+/// Runs the tests inside a machine, unless a requirement is missing. `boot` returns the console output. `extra_files`
+/// are files that only this machine requires.
 fn run_inside(extra_files: &[&str], boot: impl FnOnce() -> String) {
     let is_required = std::env::var(REQUIRE_HIL_VARIABLE).is_ok_and(|value| value == "demand");
     if let Some(reason) = missing_requirement(extra_files) {
@@ -98,14 +99,14 @@ fn run_inside(extra_files: &[&str], boot: impl FnOnce() -> String) {
     assert!(console.contains(PASSED), "the tests in the virtual machine failed; its console is above");
 }
 
-/// Returns why the tests cannot run here, if so.
+/// Returns the reason if the tests cannot run here.
 fn missing_requirement(extra_files: &[&str]) -> Option<String> {
     let release = fs::read_to_string("/etc/os-release").unwrap_or_default();
     let is_bookworm = release.lines().any(|line| line == "VERSION_CODENAME=bookworm");
     if !is_bookworm || !cfg!(target_arch = "x86_64") {
         return Some("the virtual kernels require Debian 12 on x86-64".into());
     }
-    // Files of all packages in the group `hil`. If some were missing, building the kernel would fail.
+    // Files of all packages in the group `hil`. Without them, building the kernel would fail.
     let required = [
         "/usr/src/linux-source-6.1.tar.xz",
         "/usr/bin/busybox",
@@ -141,8 +142,7 @@ fn build_kernel(kind: &str, folder: &Path) -> PathBuf {
     PathBuf::from(String::from_utf8_lossy(&output.stdout).trim())
 }
 
-/// Creates a root folder with busybox, this program, `fieldrig`, additional programs under their names, and all
-/// required libraries.
+/// Creates a root folder with busybox, this program, `fieldrig`, additional programs, and all required libraries.
 fn install_root(root: &Path, init_script: &str, extra_files: &[(PathBuf, &str)]) {
     let _ = fs::remove_dir_all(root); // Missing at the first run.
     for folder in ["bin", "dev", "lib", "proc", "rigs", "sys", "tmp"] {
@@ -196,7 +196,7 @@ fn boot(kernel: &Path, root: &Path, folder: &Path) -> String {
         .arg(format!("rootflags={}", root.display()))
         .args(["con=null", "con0=null,fd:1", "ssl=null"])
         .args(["vivid.n_devs=2", "vivid.node_types=0x1,0x1", "vivid.num_inputs=1,1", "vivid.input_types=0x0,0x1"])
-        // The memory of the kernel is a file, for which /dev/shm is often too small.
+        // The kernel's memory is a file in this folder, because /dev/shm is often too small.
         .env("TMPDIR", folder)
         .stdin(Stdio::null());
     run(&mut command, |_, _| {})

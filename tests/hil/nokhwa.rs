@@ -28,8 +28,8 @@ fn config() -> Config {
     }
 }
 
-/// Opens a camera after setting a format that nokhwa supports. nokhwa cannot open a camera whose current format it does
-/// not support, which may be set by the V4L2 tests.
+/// Opens a camera after setting a format that nokhwa supports. nokhwa cannot open a camera that is set to another
+/// format, as it may be after the V4L2 tests.
 fn open(config: Config) -> NokhwaCamera {
     let known_format = v4l2::Config { format: Some(V4l2Format::Yuyv), ..cameras::config(WEBCAM, [640, 360], RATE_HZ) };
     drop(V4l2Camera::open(known_format).expect("vivid opens"));
@@ -54,7 +54,7 @@ fn time_to_recover(camera: &mut NokhwaCamera) -> (Image, Duration) {
 fn time_to_disconnect(camera: &mut NokhwaCamera) -> Duration {
     let start_time = Instant::now();
     while !matches!(camera.next_image(Duration::from_millis(50)), Err(Error::Reconnecting { .. })) {
-        assert!(start_time.elapsed() < Duration::from_secs(10), "the driver does not notice");
+        assert!(start_time.elapsed() < Duration::from_secs(10), "the driver did not detect the outage");
     }
     start_time.elapsed()
 }

@@ -1,10 +1,9 @@
-//! Runs on the host: a machine emulated by QEMU with two Kvaser PCI cards on one CAN bus, and fault injection into
-//! their chips.
+//! Host side: boots a machine in QEMU with two Kvaser PCI cards on one CAN bus, and injects faults into their chips.
 //!
 //! QEMU's chip (SJA1000, `hw/net/can/can_sja1000.c`) produces no errors: it never sets the status bits for errors and
 //! bus-off or their interrupts, and its error counters always read 0. Therefore, these bits are set from outside in the
-//! memory of QEMU, as with a debugger. Everything else is done by the kernel's driver for real chips and the layers
-//! above it.
+//! memory of QEMU, as by a debugger. Everything else runs in the kernel's driver for real chips and the layers above
+//! it.
 
 use super::{run, write_script};
 use std::fs;
@@ -31,8 +30,8 @@ echo "hil: exit $?"
 $bb poweroff -f
 "#;
 
-/// Emulates `sudo`, which the printed commands use; all processes here run as root. The explicit path prevents the use
-/// of busybox commands.
+/// Stands in for `sudo`, which the printed commands use; all processes here run as root. The explicit path bypasses the
+/// commands of busybox.
 const SUDO: &str = "#!/bin/busybox sh\nexec /bin/\"$@\"\n";
 
 /// Request for fault injection from a test inside: interface, status bits and interrupt bits, both hexadecimal.
@@ -74,7 +73,7 @@ pub(crate) fn boot(kernel: &Path, root: &Path) -> String {
                 Ok(()) => INJECTED.to_owned(),
                 Err(error) => format!("not injected: {error}"),
             };
-            // If writing fails, the machine has ended, which its console shows.
+            // If writing fails, the machine has ended; its console shows why.
             let _ = writeln!(machine.stdin.as_mut().expect("piped"), "{answer}");
         }
     })
@@ -82,9 +81,9 @@ pub(crate) fn boot(kernel: &Path, root: &Path) -> String {
 
 /// Sets the error bits in the status of a chip and adds pending interrupts.
 ///
-/// The chip is located by its acceptance registers, where the test inside has written the interface name. In QEMU they
-/// follow mode, status, interrupts, enabled interrupts, number of waiting messages, their position, and clock divider,
-/// one byte each.
+/// The chip is located by its acceptance registers, which contain the interface name. In QEMU's memory, the bytes
+/// before them are mode, status, interrupts, enabled interrupts, number of waiting messages, their position, and clock
+/// divider.
 fn inject_fault(machine: u32, request: &str) -> std::io::Result<()> {
     let words: Vec<&str> = request.split(' ').collect();
     let &[interface, status, interrupts] = words.as_slice() else { panic!("expected three words, got {request}") };
@@ -97,7 +96,8 @@ fn inject_fault(machine: u32, request: &str) -> std::io::Result<()> {
     let mut bytes = vec![0; usize::try_from(to - from).expect("64 bits")];
     memory.read_exact_at(&mut bytes, from)?;
     let acceptance = [interface.as_bytes(), &ACCEPT_ALL].concat();
-    // The highest bit of the clock divider is set in the mode that the driver uses. Copies elsewhere in memory lack it.
+    // In the mode that the driver uses, the highest bit of the clock divider is set. It is not set in other copies of
+    // these bytes in memory.
     let is_chip = |at: &usize| bytes[*at..].starts_with(&acceptance) && bytes[*at - 1] & 0x80 != 0;
     let found: Vec<usize> = (7..bytes.len() - acceptance.len()).filter(is_chip).collect();
     let &[at] = found.as_slice() else {

@@ -1,5 +1,5 @@
-//! Tests of RealSense cameras without hardware: files that the library records from a software device are played back
-//! through the production driver, and our depth alignment is compared with that of the library.
+//! Tests of RealSense cameras without hardware. Files that the library records from a software device are played back
+//! through the production driver, and our depth alignment is compared with the library's.
 
 mod realsense_scene;
 
@@ -162,7 +162,7 @@ fn file_on_the_clock_starts_at_its_stamps() {
         writer.write(&image(&camera, number)).unwrap();
     }
     writer.finish().unwrap();
-    // Only color was written.
+    // The file contains only color.
     let clock_config = Config { depth_size_px: None, ..config(path, &camera, Pace::Clock) };
     let open = RealsenseCamera::open(Config { clock_offset_nanos: starts_at.0 - BEGIN_NANOS, ..clock_config }).unwrap();
     let mut live = Live::new(Devices { cameras: vec![Box::new(open)], ..Devices::default() }).unwrap();
@@ -253,17 +253,16 @@ fn equal_frac(a: &[u16], b: &[u16]) -> f64 {
     a.iter().zip(b).filter(|(a, b)| a == b).count() as f64 / a.len() as f64
 }
 
-/// The fast path of the library rounds the corners of a depth pixel to the nearest integer after adding half a pixel,
-/// where it should truncate. This shifts the result by half a pixel to the right and down
-/// (`src/proc/sse/sse-align.cpp`; the scalar path is correct). With a principal point shifted by half a pixel, our
-/// result is the same.
+/// The library's fast path adds half a pixel to the corners of a depth pixel and then rounds, where it should truncate.
+/// This shifts the result by half a pixel to the right and down (`src/proc/sse/sse-align.cpp`; the scalar path is
+/// correct). With a principal point shifted by half a pixel, our result is the same.
 fn with_library_rounding(color: &Intrinsics) -> Intrinsics {
     Intrinsics { principal_px: color.principal_px.map(|center| center + 0.5), ..color.clone() }
 }
 
 #[test]
 fn alignment_matches_library_except_half_pixel() {
-    // Both use single precision, so a corner occasionally falls on the other side of a pixel edge.
+    // Both computations use single precision, so a corner occasionally falls on the other side of a pixel edge.
     const EQUAL_FRAC: f64 = 0.999;
     let folder = tempfile::tempdir().unwrap();
     for color_px in [[640, 480], [1280, 720]] {

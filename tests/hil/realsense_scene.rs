@@ -17,7 +17,7 @@ use std::time::{Duration, Instant};
 /// Timeout for images of a file.
 const IMAGE_TIMEOUT: Duration = Duration::from_secs(20);
 pub(crate) const RATE_HZ: u16 = 30;
-/// Whole microseconds, like the camera clock. After a few hours, they exceed 32 bits.
+/// A whole number of microseconds, like stamps of the camera clock; it exceeds 32 bits.
 pub(crate) const BEGIN_NANOS: i64 = 11_000_000_123_000;
 pub(crate) const PERIOD_NANOS: i64 = 33_333_000;
 /// Color and depth have different stamps.

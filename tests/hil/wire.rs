@@ -33,7 +33,7 @@ fn mobile_arm_is_read_and_moved_through_drivers() {
         .spawn()
         .expect("fieldrig is installed");
     let mut line = String::new();
-    // The program ends if its output is not read, so keep the pipe open.
+    // Keep the pipe open, so that the program does not lose output.
     let mut stdout = BufReader::new(playing.stdout.take().expect("piped"));
     stdout.read_line(&mut line).expect("fieldrig prints a line");
     assert!(line.contains("\"event\":\"ready\"") && line.contains("7 motors on vcan0"), "{line}");

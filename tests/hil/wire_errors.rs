@@ -1,5 +1,5 @@
-//! Tests with error frames of controllers whose drivers report more details than that of the cards in `kvaser.rs`,
-//! inside the virtual kernel. The kernel also forwards error frames that are written to a virtual bus.
+//! Tests of CAN error frames inside the virtual kernel, which forwards error frames written to a virtual bus. They
+//! cover drivers that report more details than the driver of the cards in `kvaser.rs`.
 
 use super::can::{Wire, damiao};
 use drivers::can::{ArmConfig, Bus, BusEvent, CanArm, WireErrors};

@@ -49,7 +49,7 @@ pub(super) fn clock_offset_nanos(recording: &Path) -> i64 {
     line.trim().parse().expect("a number")
 }
 
-/// Compares at every received color image. Each must equal one of the emulated images, to the pixel.
+/// Compares samples at every received color image. Every image must be identical to an emulated one.
 pub(super) fn difference(script: &Path, wire: &Path) -> Difference {
     let offset_nanos = clock_offset_nanos(wire);
     let (script, wire) = (read_samples(script), read_samples(wire));
@@ -58,7 +58,7 @@ pub(super) fn difference(script: &Path, wire: &Path) -> Difference {
     let n_images = wire.images.len();
     for image in &wire.images {
         let simulated_stamp = Stamp(image.stamp.0 - offset_nanos);
-        // Cameras count microseconds.
+        // Stamps of cameras have a resolution of microseconds.
         let is_match = |emulated: &&Image| {
             emulated.is_depth() == image.is_depth() && emulated.stamp.0.abs_diff(simulated_stamp.0) < 1000
         };

@@ -1,9 +1,9 @@
 //! A scene model that restarts with aligned cameras.
 //!
-//! Alignment is requested when the model is created, runs in parallel with training, and its result is applied a planned
-//! number of steps after it began: if it has corrections, the model forgets everything and trains again on corrected
-//! keyframes, because a model trained on wrong poses would have to be corrected, too. In a live run, alignment is repeated
-//! when there are more keyframes, and the model restarts only if the corrections changed noticeably.
+//! Alignment is requested when the model is created and runs in parallel with training. Its result is applied a planned
+//! number of steps after alignment began. If the result contains corrections, the model restarts and trains again on
+//! corrected keyframes, because a model trained on wrong poses would need correction, too. In a live run, alignment is
+//! repeated as more keyframes arrive, and the model restarts only if the corrections changed noticeably.
 
 use crate::checkpoint::{Checkpoint, PendingCheckpoint};
 use crate::gpu::{Gpu, PassTiming};
@@ -20,16 +20,16 @@ use std::collections::{BTreeMap, VecDeque};
 use std::path::Path;
 use std::sync::Arc;
 
-/// Key of the alignment in the state of a checkpoint, and in `model.json`.
+/// Key of the alignment state in a checkpoint. [`METADATA_KEY`] is the key of the alignment in `model.json`.
 const STATE_KEY: &str = "aligned";
 const METADATA_KEY: &str = "alignment";
 
 /// A model that can restart.
 pub trait Restartable: Method {
-    /// Forgets all keyframes and all training; compiled kernels may be kept. The keyframes pushed from now on have the
-    /// corrections of `alignment`.
+    /// Discards all keyframes and all training, but may keep compiled kernels. Keyframes that are pushed afterwards
+    /// include the corrections of `alignment`.
     fn restart(&mut self, alignment: &Alignment) -> Result<(), Error>;
-    /// Correction of a camera that was optimized with the scene, relative to the pushed keyframes; `None` if there is
+    /// Correction of a camera, relative to the pushed keyframes, that was optimized with the scene. `None` if there is
     /// none.
     fn learned_correction(&mut self, _camera: &str) -> Result<Option<CameraCorrection>, Error> {
         Ok(None)
@@ -39,25 +39,25 @@ pub trait Restartable: Method {
 /// A resumed model, and the keyframes that it was not trained on.
 pub type ResumedModel = (Box<dyn Method>, Vec<Arc<Keyframe>>);
 
-/// A model, and the alignment of its keyframes' cameras.
+/// A model with alignment of its keyframes' cameras.
 #[derive(Debug)]
 pub struct Aligned<M> {
     model: M,
     choice: CameraRefinement,
     alignment_task: AlignmentTask,
-    /// The uncorrected keyframes in the order of their arrival, kept until alignment is done.
+    /// The uncorrected keyframes in order of arrival, kept until alignment is done.
     original_keyframes: Vec<Arc<Keyframe>>,
-    /// How many of them had arrived when alignment began; `None` before that.
+    /// Number of original keyframes when alignment began; `None` before that.
     n_begun: Option<usize>,
-    /// Number of steps from the beginning of alignment to the use of its result.
+    /// Number of steps from the start of alignment until its result is applied.
     alignment_steps: u64,
-    /// Step at which the result of the alignment that has begun is due.
+    /// Step at which the result of the running alignment is due.
     due_step: Option<u64>,
-    /// Numbers of keyframes at which alignment begins; if there were none from the start, it begins at the first step.
+    /// Keyframe counts at which alignment begins. Empty from the start if it begins at the first step instead.
     at_keyframes: VecDeque<usize>,
     /// Whether alignment is repeated with more keyframes.
     is_live: bool,
-    /// Steps of the model before its last restart.
+    /// Number of steps before the last restart.
     n_steps_before_restart: u64,
 }
 
@@ -83,7 +83,8 @@ fn id_of(keyframe: &Keyframe) -> (&str, i64) {
 }
 
 impl<M: Restartable + 'static> Aligned<M> {
-    /// A model whose keyframes are aligned as specified by `choice`; the result is applied early in `n_planned_steps`.
+    /// Wraps a model and aligns its keyframes as specified by `choice`. The result is applied early in
+    /// `n_planned_steps`.
     pub fn new(model: M, choice: CameraRefinement, is_software: bool, n_planned_steps: u64) -> Self {
         Self {
             model,
@@ -99,7 +100,7 @@ impl<M: Restartable + 'static> Aligned<M> {
         }
     }
 
-    /// The model itself if no alignment is requested, otherwise with alignment.
+    /// Wraps the model with alignment if the options request it.
     pub fn if_requested(model: M, common: &CommonOptions, gpu: &Gpu) -> Box<dyn Method> {
         if common.align == CameraRefinement::default() {
             return Box::new(model);
@@ -118,8 +119,8 @@ impl<M: Restartable + 'static> Aligned<M> {
         Ok(Self { alignment_task, ..Self::new(model, CameraRefinement::default(), false, 0) })
     }
 
-    /// Resumes from a checkpoint. `resume` receives the corrected keyframes and finds those that the model was trained
-    /// on.
+    /// Resumes from a checkpoint. `resume` receives the corrected keyframes, and returns the model and the keyframes
+    /// that it was not trained on.
     pub fn resume(
         checkpoint: &Checkpoint,
         keyframes: &[Arc<Keyframe>],
@@ -152,7 +153,7 @@ impl<M: Restartable + 'static> Aligned<M> {
         let originals: BTreeMap<_, _> = keyframes.iter().map(|keyframe| (id_of(keyframe), keyframe)).collect();
         let original = |id: (&str, i64)| originals.get(&id).map(|keyframe| Arc::clone(keyframe));
         let original_keyframes = ids.iter().filter_map(|(camera, nanos)| original((camera, *nanos))).collect();
-        // These are corrected when they are pushed again.
+        // Uncorrected, because `push` corrects them.
         let untrained = untrained.iter().filter_map(|keyframe| original(id_of(keyframe))).collect();
         let aligned = Self {
             model,
@@ -169,7 +170,7 @@ impl<M: Restartable + 'static> Aligned<M> {
         Ok((Box::new(aligned), untrained))
     }
 
-    /// Starts alignment, if it is requested and there are enough keyframes.
+    /// Starts alignment if it is requested and there are enough keyframes.
     fn begin_alignment(&mut self) {
         let n_keyframes = self.original_keyframes.len();
         let has_begun = self.n_begun.is_some();
@@ -183,7 +184,7 @@ impl<M: Restartable + 'static> Aligned<M> {
         self.alignment_task.begin(self.original_keyframes[..n_begun].to_vec(), &self.choice);
     }
 
-    /// Applies the result of alignment when due; if it changes corrections, restarts the model.
+    /// Applies the result of alignment when it is due, and restarts the model if corrections changed.
     fn finish_alignment_when_due(&mut self) -> Result<(), Error> {
         let step = self.model.progress().step;
         let is_idle = self.model.is_idle() && step > 0;
@@ -191,7 +192,7 @@ impl<M: Restartable + 'static> Aligned<M> {
         if self.alignment_task.is_done() || !is_due {
             return Ok(());
         }
-        self.begin_alignment(); // A model that was resumed at this step has not started it.
+        self.begin_alignment(); // Not started yet if the model was resumed at this step.
         let is_changed = self.alignment_task.finish(&self.original_keyframes)?;
         (self.n_begun, self.due_step) = (None, None);
         let n_keyframes = self.original_keyframes.len();
@@ -229,7 +230,7 @@ impl<M: Restartable + 'static> Method for Aligned<M> {
     fn push(&mut self, keyframe: Arc<Keyframe>) -> Result<(), Error> {
         self.model.push(self.alignment_task.corrected(&keyframe))?;
         let is_used = !self.alignment_task.is_done() && keyframe.split != Split::Test && keyframe.is_finite();
-        // After resuming, validation keyframes are pushed again.
+        // Validation keyframes are pushed again after resuming.
         if is_used && !self.original_keyframes.iter().any(|known| id_of(known) == id_of(&keyframe)) {
             self.original_keyframes.push(keyframe);
         }
@@ -367,7 +368,7 @@ mod tests {
     use calibration::ParamSet;
     use calibration::scenes::{Miscalibration, capture, remaining, wrong_extrinsics};
 
-    /// The step at which the result is applied.
+    /// Step at which the alignment result is applied.
     const ALIGNMENT_STEP: u64 = 6;
 
     fn tsdf(gpu: &Arc<Gpu>) -> TsdfModel {
@@ -460,7 +461,7 @@ mod tests {
         assert_eq!(
             interrupted.checkpoint().unwrap().finish().unwrap(),
             uninterrupted_end,
-            "resumed when alignment is due"
+            "must also match if resumed at the step at which alignment is due"
         );
 
         let folder = tempfile::tempdir().unwrap();
@@ -508,7 +509,7 @@ mod tests {
         let before = correction(&*model);
         train(&mut *model, ALIGNMENT_STEP + 2);
         let has_restarted = model.progress().step < step + ALIGNMENT_STEP + 2;
-        assert_eq!(has_restarted, correction(&*model) != before, "it restarts only for other corrections");
+        assert_eq!(has_restarted, correction(&*model) != before, "must restart only if corrections change");
         let (degrees, mm) = remaining_after(&*model);
         assert!(degrees < 0.05 && mm < 0.5, "{degrees} degrees, {mm} mm");
         train(&mut *model, 3 * ALIGNMENT_STEP);
@@ -516,7 +517,7 @@ mod tests {
     }
 
     #[test]
-    fn empty_model_is_idle_and_unalignable_one_trains_on() {
+    fn empty_model_is_idle_and_failed_alignment_does_not_stop_training() {
         let gpu = Gpu::open(&GpuOptions::default()).unwrap();
         check_training_continues(tsdf(&gpu));
         check_training_continues(nerf(&gpu));

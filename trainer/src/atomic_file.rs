@@ -12,8 +12,8 @@ pub fn partial_path(path: &Path) -> PathBuf {
     partial.into()
 }
 
-/// Writes a file under a temporary name, syncs it, and renames it: whatever happens, the name refers to the complete previous
-/// file or the complete new one. A partial file is removed after an error.
+/// Writes a file under a temporary name, syncs it and renames it. The final name therefore always refers to a complete
+/// file: the previous one or the new one. A partial file is removed after an error.
 pub fn write(path: &Path, contents: impl FnOnce(&mut File) -> std::io::Result<()>) -> Result<(), Error> {
     let partial = partial_path(path);
     let written = File::create(&partial).and_then(|mut file| {
@@ -29,7 +29,7 @@ pub fn write(path: &Path, contents: impl FnOnce(&mut File) -> std::io::Result<()
         }
     });
     if written.is_err() {
-        let _ = std::fs::remove_file(&partial); // An incomplete file only takes up space.
+        let _ = std::fs::remove_file(&partial); // Best effort: a leftover partial file is harmless.
     }
     written.map_err(|source| Error::Write { path: path.to_owned(), source })
 }

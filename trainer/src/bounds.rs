@@ -1,10 +1,10 @@
-//! Bounds of most of a model, for the first view of a model without a list of cameras.
+//! Approximate bounds of a model, for the initial view of a model without a list of cameras.
 
 use kinematics::quantile::{Rank, quantile};
 
-/// Fraction of the points inside the radius, so that stray points and distant backgrounds stay outside.
+/// Fraction of the points inside the radius. Stray points and distant backgrounds stay outside.
 const INSIDE_FRAC: f64 = 0.8;
-/// Minimum radius, meters: even a model of one point needs some size.
+/// Minimum radius, meters. A model of a single point needs one, too.
 pub(crate) const MIN_RADIUS_M: f64 = 0.01;
 
 /// A sphere that contains most of a model.
@@ -17,7 +17,7 @@ pub struct Bounds {
 }
 
 impl Bounds {
-    /// The median along each axis, and the radius that contains most of the points; `None` without points.
+    /// Centered at the median along each axis, with a radius that contains most points; `None` without points.
     pub(crate) fn of_points(points_m: &[[f64; 3]]) -> Option<Self> {
         let quantile = |mut values: Vec<f64>, frac| quantile(&mut values, frac, Rank::Nearest);
         let middle = |axis: usize| quantile(points_m.iter().map(|point| point[axis]).collect(), 0.5);

@@ -1,4 +1,4 @@
-//! Training state on disk: a file that is either complete or absent, and describes its contents.
+//! Training state on disk: a self-describing file that is either complete or absent.
 //!
 //! `docs/reference/files.md` describes the layout.
 
@@ -13,7 +13,7 @@ use std::path::Path;
 const MAGIC: [u8; 8] = *b"FRIGCKPT";
 /// Version of the layout and of the states of all methods.
 const VERSION: u32 = 4;
-/// Magic, version, and length of the header.
+/// Length of magic, version and header length together.
 const PREAMBLE_BYTES: usize = 16;
 const CHECKSUM_BYTES: usize = 32;
 
@@ -24,9 +24,9 @@ pub struct Checkpoint {
     pub method: String,
     /// Training time so far, seconds.
     pub seconds: f64,
-    /// SHA-256 of the model that rendered the depth of keyframes without depth, if there was one.
+    /// SHA-256 of the model that rendered depth for keyframes without depth, if one was used.
     pub depth_from: Option<String>,
-    /// Flags of the run by name, for continuing it. They include the limit of training.
+    /// Flags of the run by name, needed to continue it. They include the training limit.
     pub flags: BTreeMap<String, String>,
     /// Whether training had reached its limit.
     pub is_finished: bool,
@@ -45,7 +45,7 @@ pub struct Array {
     pub bytes: Vec<u8>,
 }
 
-/// A state that is being read back from the GPU; training may continue meanwhile.
+/// Training state that is being read back from the GPU. Training may continue meanwhile.
 pub struct PendingCheckpoint(Box<dyn FnOnce() -> Result<Checkpoint, Error> + Send>);
 
 /// The JSON header between preamble and arrays.
@@ -102,8 +102,8 @@ impl Checkpoint {
         }
     }
 
-    /// Writes the file under a temporary name, syncs it, and renames it: whatever happens, the name refers to the
-    /// complete previous file or the complete new one.
+    /// Writes the file under a temporary name, syncs it and renames it. The final name therefore always refers to a
+    /// complete file: the previous one or the new one.
     pub fn write(&self, path: &Path) -> Result<(), Error> {
         atomic_file::write(path, |file| self.write_to(file))
     }
@@ -157,7 +157,7 @@ impl Checkpoint {
         }
         let word = |at: usize| u32::from_le_bytes([preamble[at], preamble[at + 1], preamble[at + 2], preamble[at + 3]]);
         if word(8) != VERSION {
-            return Err(format!("version {} of the format, this program reads {VERSION}", word(8)));
+            return Err(format!("format version {}, this program reads version {VERSION}", word(8)));
         }
         let whole = bytes.len().checked_sub(CHECKSUM_BYTES).filter(|n| *n >= PREAMBLE_BYTES).ok_or("truncated")?;
         let (body, checksum) = bytes.split_at(whole);
@@ -250,7 +250,7 @@ mod tests {
             bytes[at] = to;
             error_of(&bytes)
         };
-        assert_eq!(error_with_byte(8, 1), "version 1 of the format, this program reads 4");
+        assert_eq!(error_with_byte(8, 1), "format version 1, this program reads version 4");
         assert_eq!(error_with_byte(15, 255), "truncated");
         for at in [20, whole.len() - 40, whole.len() - 1] {
             assert_eq!(error_with_byte(at, 0xff), "damaged: the checksum does not match", "byte {at}");

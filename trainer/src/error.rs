@@ -34,7 +34,7 @@ pub enum Error {
     /// The GPU stopped answering.
     #[error("the GPU stopped answering: its driver reset or lost the device")]
     DeviceLost,
-    /// The GPU has no memory left for a buffer, or for commands or a transfer, which have no name and size.
+    /// The GPU has no memory left for a buffer, or for commands; for commands, `label` is empty and `bytes` is 0.
     #[error(
         "the GPU ran out of memory{}; close other programs that use it, or lower --max-splats, --max-bytes or the image size",
         buffer_suffix(label, *bytes)
@@ -128,9 +128,9 @@ pub enum Error {
     /// Two depth images differ in size.
     #[error("rendered depth has {rendered} pixels, true depth {truth}")]
     DepthSizeMismatch {
-        /// Number of pixels of the rendered one.
+        /// Number of pixels of the rendered image.
         rendered: usize,
-        /// Number of pixels of the true one.
+        /// Number of pixels of the true image.
         truth: usize,
     },
     /// A file cannot be read.
@@ -149,10 +149,10 @@ pub enum Error {
         /// Cause.
         source: std::io::Error,
     },
-    /// LPIPS was requested from a program that was built without it.
+    /// LPIPS was requested, but this program was built without it.
     #[error("this program was built without LPIPS (cargo feature `lpips`)")]
     LpipsNotBuilt,
-    /// A file is not a valid file of LPIPS weights.
+    /// A file does not contain valid LPIPS weights.
     #[cfg(feature = "lpips")]
     #[error("{path:?} does not hold LPIPS weights for SqueezeNet: {source}")]
     LpipsWeights {
@@ -161,11 +161,11 @@ pub enum Error {
         /// Cause.
         source: candle_core::Error,
     },
-    /// The network of LPIPS failed.
+    /// The LPIPS network failed.
     #[cfg(feature = "lpips")]
     #[error("LPIPS network failed")]
     LpipsNetwork(#[source] candle_core::Error),
-    /// A file of splats, or a model's metadata, is invalid.
+    /// A splat file or the metadata of a model is invalid.
     #[error("cannot parse {path:?}: {reason}")]
     SplatFile {
         /// The file.
@@ -173,7 +173,7 @@ pub enum Error {
         /// Description of the problem.
         reason: String,
     },
-    /// A file is not a checkpoint, incomplete, damaged, or of another version.
+    /// A file is not a checkpoint, or it is incomplete, damaged or of another version.
     #[error("cannot read checkpoint {path:?}: {reason}")]
     Checkpoint {
         /// The file.
@@ -223,7 +223,7 @@ pub enum Error {
     NoSplats {
         /// Folder or file.
         path: PathBuf,
-        /// What to do instead, as the end of the sentence.
+        /// Suggested action, which completes the sentence.
         hint: &'static str,
         /// Cause.
         source: Box<Self>,
@@ -240,12 +240,12 @@ pub enum Error {
 }
 
 impl Error {
-    /// Whether the GPU caused the error: on another device the same work may succeed.
+    /// Whether the GPU caused the error. If so, the same work may succeed on another device.
     pub fn is_gpu_error(&self) -> bool {
         matches!(self, Self::DeviceLost | Self::OutOfMemory { .. } | Self::Rejected(_))
     }
 
-    /// Whether there is no memory for a buffer of the requested size.
+    /// Whether a buffer of the requested size could not be allocated.
     pub(crate) fn is_out_of_memory(&self) -> bool {
         matches!(self, Self::OutOfMemory { .. } | Self::BufferTooLarge { .. })
     }

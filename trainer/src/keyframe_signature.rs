@@ -1,4 +1,4 @@
-//! Signatures of keyframes that a model was trained on: identify and verify them without their pixels.
+//! Signatures that identify and verify the training keyframes of a model without their pixels.
 
 use crate::Error;
 use keyframe::{Keyframe, Split};
@@ -44,12 +44,12 @@ impl KeyframeSignature {
         }
     }
 
-    /// Whether this is the keyframe of a camera with a stamp.
+    /// Whether the keyframe has this camera and stamp.
     pub(crate) fn is_of(&self, camera: &str, stamp: Stamp) -> bool {
         self.camera == camera && self.stamp_nanos == stamp.0
     }
 
-    /// Description of a difference from the recorded keyframe; `None` if they match.
+    /// Describes a difference between `keyframe` and the recorded one; `None` if they match.
     fn difference(&self, keyframe: &Keyframe) -> Option<String> {
         let other = Self::of(keyframe);
         let [[width, height], [other_width, other_height]] = [self.size_px, other.size_px];
@@ -68,7 +68,7 @@ impl KeyframeSignature {
     }
 }
 
-/// The matched keyframes in the order of a list, and all others.
+/// The matched keyframes in the expected order, and all other keyframes.
 pub(crate) type MatchedAndOthers = (Vec<Arc<Keyframe>>, Vec<Arc<Keyframe>>);
 
 /// Finds the expected keyframes. Fails if one is missing or differs.

@@ -5,7 +5,7 @@ use calibration::{Alignment, CameraCorrection};
 use std::collections::BTreeMap;
 use std::path::Path;
 
-/// File with the description of a saved model, in its folder.
+/// File that describes a saved model, in the model's folder.
 pub(crate) const METADATA_FILE: &str = "model.json";
 
 /// Camera corrections and alignment of a saved model.

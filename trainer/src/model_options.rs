@@ -1,4 +1,4 @@
-//! Options of a model: those that all methods share, and those of its method.
+//! Options of a model: common options of all methods, and options specific to its method.
 
 use crate::Error;
 use calibration::CameraRefinement;
@@ -12,7 +12,7 @@ pub trait MethodOptions: Serialize + DeserializeOwned + Default {
     const METHOD: &'static str;
 }
 
-/// Options that all methods share. A method ignores those that do not apply to it.
+/// Options that all methods share. A method ignores options that do not apply to it.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CommonOptions {
@@ -24,14 +24,14 @@ pub struct CommonOptions {
     pub n_planned_steps: u64,
     /// Camera parameters that are optimized with the scene.
     pub cameras: CameraRefinement,
-    /// Camera parameters that are estimated by registering keyframes with depth, before the model is trained on them.
+    /// Camera parameters that alignment estimates by registering keyframes that have depth.
     pub align: CameraRefinement,
-    /// Numbers of keyframes at which they are estimated, in a run whose keyframes arrive while it trains. If empty, they
-    /// are estimated once, from the keyframes that are known at the first step.
+    /// For live runs: keyframe counts at which alignment runs. If empty, alignment runs once, with the keyframes
+    /// available at the first step.
     pub align_at_keyframes: Vec<usize>,
 }
 
-/// Options of a model. `S` are those of its method, by default as JSON, because the type depends on the method.
+/// Options of a model. `S` is the type of the method-specific options; the default, JSON, holds those of any method.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ModelOptions<S = Value> {
@@ -55,7 +55,7 @@ impl Default for CommonOptions {
 }
 
 impl<S> ModelOptions<S> {
-    /// These options with a change.
+    /// Applies a change and returns the changed options.
     #[must_use]
     pub fn with(mut self, change: impl FnOnce(&mut Self)) -> Self {
         change(&mut self);
@@ -64,14 +64,14 @@ impl<S> ModelOptions<S> {
 }
 
 impl<S> From<S> for ModelOptions<S> {
-    /// Options of a method with the default common options.
+    /// Combines method-specific options with the default common options.
     fn from(specific: S) -> Self {
         Self { common: CommonOptions::default(), specific }
     }
 }
 
 impl ModelOptions {
-    /// The options with those of the method in their own type.
+    /// Converts the method-specific options from JSON to their own type.
     ///
     /// # Errors
     ///
@@ -84,7 +84,7 @@ impl ModelOptions {
 }
 
 impl<S: MethodOptions> ModelOptions<S> {
-    /// The options with those of the method as JSON.
+    /// Converts the method-specific options to JSON.
     pub fn to_json(&self) -> ModelOptions {
         ModelOptions { common: self.common.clone(), specific: json(&self.specific) }
     }
@@ -122,8 +122,8 @@ mod tests {
         let message = options.typed::<MeanColorOptions>().unwrap_err().to_string();
         assert!(message.contains("mean-color") && message.contains("fast"), "{message}");
         options.specific = serde_json::json!({ "rate": 0.5, "seed": 1 });
-        assert!(options.typed::<MeanColorOptions>().is_err(), "a common option among those of the method");
+        assert!(options.typed::<MeanColorOptions>().is_err(), "common options must be rejected");
         options.specific = serde_json::json!({});
-        assert!(options.typed::<MeanColorOptions>().is_err(), "no option may be missing");
+        assert!(options.typed::<MeanColorOptions>().is_err(), "missing options must be rejected");
     }
 }

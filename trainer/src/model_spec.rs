@@ -26,7 +26,7 @@ pub struct Resumed {
     pub model_spec: ModelSpec,
     /// The model.
     pub method: Box<dyn Method>,
-    /// Keyframes it was not trained on: test keyframes and new ones.
+    /// Keyframes that the model was not trained on: test keyframes and new ones.
     pub untrained: Vec<Arc<Keyframe>>,
 }
 
@@ -39,8 +39,8 @@ pub struct LoadedModel {
 }
 
 impl ModelSpec {
-    /// A model with the default options of its method, except for the `settings`: names and values of options. Settings
-    /// that the method does not have are ignored, so that the same settings can be given to several methods.
+    /// The default options of the method, overridden by `settings`: names and values of options. Settings that the
+    /// method does not have are ignored, so that several methods can share one list of settings.
     ///
     /// # Errors
     ///
@@ -57,7 +57,7 @@ impl ModelSpec {
         Ok(model_spec)
     }
 
-    /// A model of the method that these options belong to.
+    /// The spec of a model with these options. Their type determines the method.
     ///
     /// # Errors
     ///
@@ -66,7 +66,7 @@ impl ModelSpec {
         Ok(Self { kind: registered(S::METHOD)?, options: options.to_json() })
     }
 
-    /// The options in the type of their method; `None` if the method is another one.
+    /// The options as the method-specific type `S`; `None` if the model uses another method.
     ///
     /// # Errors
     ///
@@ -90,7 +90,7 @@ impl ModelSpec {
     }
 }
 
-/// Restores a model from a checkpoint. `keyframes` must contain those it was trained on.
+/// Restores a model from a checkpoint. `keyframes` must include those that the model was trained on.
 ///
 /// # Errors
 ///

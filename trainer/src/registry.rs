@@ -1,4 +1,4 @@
-//! The methods that models can be trained with. This is the only file that knows all of them.
+//! The registry of training methods. No other file lists all methods.
 
 use crate::method_entry::MethodEntry;
 use crate::model_metadata::METADATA_FILE;
@@ -35,13 +35,13 @@ impl ModelKind {
         self.0
     }
 
-    /// Whether the options of the method include one of this name.
+    /// Whether the method has an option of this name.
     pub fn has_option(self, name: &str) -> bool {
         (self.0.default_options)().get(name).is_some()
     }
 
-    /// The method of a saved model. In a folder, from the method in `model.json` or else from the files; otherwise from
-    /// the extension of the file. `None` if neither identifies one.
+    /// The method of a saved model. `None` if it cannot be determined. For a folder, it is read from `model.json`, or
+    /// else derived from the files in the folder; for a single file, it is derived from the extension.
     ///
     /// # Errors
     ///
@@ -63,7 +63,7 @@ impl ModelKind {
         Ok(metadata.method.as_deref().and_then(Self::from_name).or_else(by_files))
     }
 
-    /// The method whose models can be single files with the extension of this one.
+    /// The method that saves single files with the extension of this file.
     pub fn of_single_file(file: &Path) -> Option<Self> {
         let extension = file.extension()?.to_str()?.to_ascii_lowercase();
         let has_extension =
@@ -71,7 +71,7 @@ impl ModelKind {
         Self::ALL.iter().copied().find(has_extension)
     }
 
-    /// Names of the files of saved models of all methods, in the order in which they are put in place and hashed.
+    /// Names of the model files of all methods, in the order in which the files are moved into place and hashed.
     pub fn model_files() -> impl Iterator<Item = &'static str> {
         std::iter::once(METADATA_FILE).chain(Self::ALL.iter().flat_map(|kind| kind.0.files).copied())
     }

@@ -1,11 +1,11 @@
-//! Requests for pictures of the model, and the pictures.
+//! Requests for pictures of a model, and the rendered pictures.
 
 use crate::gpu::Buffer;
 use keyframe::Shutter;
 use kinematics::{Stamp, Transform};
 use std::sync::Arc;
 
-/// A box with sides along the axes of its frame, meters.
+/// A box aligned with the axes of its frame, meters.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Aabb {
     /// Pose of the box's frame.
@@ -50,9 +50,9 @@ pub struct RenderRequest {
     pub crop: Option<Aabb>,
     /// Background color, sRGB 0 to 1.
     pub background_srgb: [f32; 3],
-    /// Camera and time whose light and exposure to use, if the model has them; `None`: those of the mean image.
+    /// Camera and stamp of the image whose lighting and exposure to use, if the model has them; `None`: the mean image.
     pub appearance_of: Option<(Arc<str>, Stamp)>,
-    /// Whether depth is requested. Without it [`Picture::depth_m`] is empty, and half as many bytes are read back from the GPU.
+    /// Whether depth is requested. Without depth, [`Picture::depth_m`] is empty and the GPU readback is half as large.
     pub depth: bool,
 }
 
@@ -69,7 +69,7 @@ pub struct Picture {
 }
 
 impl Picture {
-    /// The buffers to read back for a rendered picture; the depths only if requested.
+    /// The buffers to read back for a rendered picture. Depths are included only if requested.
     pub(crate) fn buffers<'a>(
         size_px: [u32; 2],
         pixels: &'a Buffer,
@@ -79,13 +79,13 @@ impl Picture {
         std::iter::once(pixels).chain(depths).map(|buffer| (buffer, n_bytes)).collect()
     }
 
-    /// The picture from the data read back from [`Self::buffers`].
+    /// Assembles the picture from the data read back from [`Self::buffers`].
     pub(crate) fn from_parts(size_px: [u32; 2], parts: &[&[u8]]) -> Self {
         let depth_m = parts.get(1).map_or(Vec::new(), |bytes| bytemuck::pod_collect_to_vec(bytes));
         Self { size_px, rgba_srgb: parts[0].to_vec(), depth_m }
     }
 
-    /// A picture of only background.
+    /// A picture that shows only the background.
     pub(crate) fn empty(size_px: [u32; 2], background_srgb: [f32; 3], depth: bool) -> Self {
         let n = size_px[0] as usize * size_px[1] as usize;
         #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to 0 to 255")]

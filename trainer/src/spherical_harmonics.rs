@@ -113,7 +113,7 @@ mod tests {
 
     #[test]
     fn basis_is_orthonormal_on_the_sphere() {
-        const N_AZIMUTHS: u32 = 16; // Sufficient for products of degree 6: the sum over azimuths is then exact.
+        const N_AZIMUTHS: u32 = 16; // Makes the sum over azimuths exact for products of degree 6.
         // Gauss-Legendre with 4 points is exact to degree 7 in z (Abramowitz and Stegun 1964, table 25.4).
         const HEIGHTS: [(f64, f64); 4] = [
             (-0.861_136_311_594_052_6, 0.347_854_845_137_453_9),
@@ -144,8 +144,8 @@ mod tests {
 
     #[test]
     fn basis_has_the_signs_of_published_splat_files() {
-        // Here every polynomial is positive before its constant (x > sqrt(3) y > 0, z large), so the signs are those
-        // of the constants.
+        // In this direction (x > sqrt(3) y > 0, z large), every polynomial without its constant is positive, so the
+        // constants determine the signs.
         let signs = basis(&Vector3::new(0.36, 0.2, 0.9).normalize()).map(f64::signum);
         let published = [1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1].map(f64::from);
         assert_eq!(signs, published);

@@ -1,18 +1,18 @@
-//! The training submit in flight, and the time that a step takes.
+//! The training submit in flight, and the measured duration of a step.
 
 use crate::Error;
 use crate::gpu::{Gpu, PendingRead};
 use crate::method::submit_millis;
 use std::time::Instant;
 
-/// Weight of the last submit in the smoothed time of a step.
+/// Weight of the latest submit in the smoothed step time.
 const NEW_WEIGHT: f64 = 0.2;
 
 /// Tracks training submits: at most one is in flight while the next one is recorded.
 #[derive(Debug)]
 pub(crate) struct Submits {
     in_flight: Option<InFlight>,
-    /// When the last submit was found to be complete.
+    /// Time at which the last submit was found to be complete.
     idle_since: Instant,
     step_millis: f64,
     /// Whether pictures are requested.
@@ -31,7 +31,7 @@ impl Submits {
         Self { in_flight: None, idle_since: Instant::now(), step_millis: 0.0, is_watched: false }
     }
 
-    /// Records a submit that returns counters at its end. `since`: when recording it began.
+    /// Registers a submit that returns counters at its end. Recording of the submit began at `since`.
     pub(crate) fn begin(&mut self, counters: PendingRead, n_steps: u64, since: Instant) {
         self.in_flight = Some(InFlight { counters, n_steps, since });
     }
@@ -41,7 +41,7 @@ impl Submits {
         let Some(InFlight { counters, n_steps, since }) = self.in_flight.take() else { return Ok(None) };
         let counters = counters.finish(gpu)?;
         let completed = Instant::now();
-        let began = since.max(self.idle_since); // The previous submit was still running then.
+        let began = since.max(self.idle_since); // The previous submit may have been running at `since`.
         self.idle_since = completed;
         let millis = (completed - began).as_secs_f64() * 1e3 / n_steps.max(1) as f64;
         self.step_millis = match self.step_millis {
@@ -51,24 +51,24 @@ impl Submits {
         Ok(Some(counters))
     }
 
-    /// Steps of the submit in flight.
+    /// Number of steps in the submit in flight.
     pub(crate) fn n_steps_in_flight(&self) -> u64 {
         self.in_flight.as_ref().map_or(0, |in_flight| in_flight.n_steps)
     }
 
-    /// Number of steps that fit into the time limit of a submit; `None` before the first one was timed.
+    /// Number of steps that fit into the time limit of a submit; `None` until a submit has been timed.
     pub(crate) fn n_steps_in_limit(&self) -> Option<u64> {
         #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "rounded down on purpose")]
         let n_steps = |step_millis: f64| (submit_millis(self.is_watched) / step_millis) as u64;
         (self.step_millis > 0.0).then(|| n_steps(self.step_millis))
     }
 
-    /// Smoothed GPU time of a step, milliseconds; 0 before the first one was timed.
+    /// Smoothed GPU time of a step, milliseconds; 0 until a submit has been timed.
     pub(crate) fn step_millis(&self) -> f64 {
         self.step_millis
     }
 
-    /// Forgets the time of a step.
+    /// Resets the smoothed step time.
     pub(crate) fn reset_time(&mut self) {
         self.step_millis = 0.0;
     }
@@ -82,7 +82,7 @@ impl Submits {
         self.is_watched
     }
 
-    /// Sets whether pictures are requested, so that submits must be short.
+    /// Sets whether pictures are requested. If so, submits must be short.
     pub(crate) fn set_watched(&mut self, watched: bool) {
         self.is_watched = watched;
     }

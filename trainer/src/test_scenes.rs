@@ -1,4 +1,4 @@
-//! Options and requests that suit the scenes of known shapes.
+//! Model options and render requests for the scenes of known shapes.
 
 use crate::model_options::ModelOptions;
 use crate::tsdf::TsdfOptions;

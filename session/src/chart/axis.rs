@@ -3,11 +3,11 @@
 /// How values map to positions.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Scale {
-    /// Equal distances are equal differences.
+    /// Linear.
     Linear,
-    /// Values are above 0.
+    /// Logarithmic, for values above 0.
     Log,
-    /// The values, in ascending order, are spaced evenly; positions between two of them are interpolated linearly.
+    /// Evenly spaced levels, given in ascending order. Positions between two levels are interpolated linearly.
     Levels(Vec<f64>),
 }
 
@@ -95,7 +95,7 @@ fn level_position(levels: &[f64], value: f64) -> f64 {
     (next - 1) as f64 + (value - before) / (after - before)
 }
 
-/// Multiples of 1, 2 or 5 times a power of ten.
+/// Ticks at multiples of 1, 2 or 5 times a power of ten.
 fn linear_ticks(low: f64, high: f64) -> Vec<f64> {
     let rough = (high - low) / N_TICKS;
     let power = 10.0_f64.powf(rough.log10().floor());
@@ -109,7 +109,8 @@ fn linear_ticks(low: f64, high: f64) -> Vec<f64> {
     ticks
 }
 
-/// 1, 2 and 5 times powers of ten; only the powers if there are many, all integer multiples if there are few.
+/// Ticks at 1, 2 and 5 times powers of ten. If these are too many, only at the powers; if too few, at all multiples of
+/// the powers.
 fn log_ticks(low: f64, high: f64) -> Vec<f64> {
     let mut powers = Vec::new();
     let mut power = 10.0_f64.powf(low.log10().floor());

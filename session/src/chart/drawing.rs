@@ -24,7 +24,7 @@ impl TextSize {
     }
 }
 
-/// Which point of a text is at its position.
+/// Which part of a text is at its position.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Anchor {
     /// The text begins at the position.
@@ -38,7 +38,7 @@ pub enum Anchor {
 /// A shape; y points down.
 #[derive(Clone, Debug, PartialEq)]
 pub enum VectorShape {
-    /// A line through points; `dash` is the length of dashes and gaps.
+    /// A line through points.
     Line {
         /// Corners, units.
         points: Vec<[f64; 2]>,
@@ -58,9 +58,9 @@ pub enum VectorShape {
         /// Opacity, 0 to 1.
         opacity_frac: f64,
     },
-    /// One line of text, centered vertically on `at`; `vertical` text runs from bottom to top.
+    /// One line of text.
     Text {
-        /// Position of the anchor on the baseline, units.
+        /// Position of the anchor, vertically in the middle of the line, units.
         at: [f64; 2],
         /// The text.
         text: String,
@@ -70,7 +70,7 @@ pub enum VectorShape {
         size: TextSize,
         /// The part of the text that is at the position.
         anchor: Anchor,
-        /// Whether the text runs upwards.
+        /// Whether the text runs from bottom to top.
         vertical: bool,
     },
 }

@@ -1,7 +1,7 @@
 //! Line charts, drawn once for both SVG and PNG.
 //!
-//! The colors are those of Okabe and Ito (2008), which color-blind people can distinguish. The dots of lines also
-//! differ in shape, for grayscale prints.
+//! The colors are the color-blind safe palette of Okabe and Ito (2008). Lines also differ in the shape of their dots,
+//! for readers of grayscale prints.
 
 mod axis;
 pub mod drawing;
@@ -37,7 +37,7 @@ pub struct Line {
     pub label: String,
     /// Points, ordered by x.
     pub points: Vec<Point>,
-    /// Whether it is drawn dashed, as the line of another trainer.
+    /// Whether the line is drawn dashed, for example because it belongs to another trainer.
     pub is_peer: bool,
 }
 
@@ -61,7 +61,7 @@ pub struct Marker {
     pub x: f64,
     /// Text at the marker.
     pub label: String,
-    /// The line to which it belongs.
+    /// Index of the line to which it belongs.
     pub line_ix: usize,
 }
 

@@ -1,4 +1,4 @@
-//! Draws the SVG of a drawing as a PNG image. The font is part of the program, so no system fonts are needed.
+//! Rasterizes a drawing to PNG. The font is built into the program, so no system fonts are needed.
 
 use super::drawing::{Drawing, TextSize};
 use crate::error::Context;
@@ -10,12 +10,12 @@ use std::sync::{Arc, LazyLock};
 /// The Latin letters of Noto Sans Mono 2.014, under the SIL Open Font License in `font/OFL.txt`.
 const FONT: &[u8] = include_bytes!("font/NotoSansMono-Latin.ttf");
 const FONT_FAMILY: &str = "Noto Sans Mono";
-/// Width of every letter as a fraction of the font size: the font is monospaced.
+/// Width of every letter of the monospaced font, as a fraction of the font size.
 const LETTER_WIDTH_FRAC: f64 = 0.6;
 /// Pixels per unit of the drawing.
 const PIXELS_PER_UNIT: u32 = 2;
 
-/// The font, in place of all sans-serif fonts.
+/// The built-in font, which replaces all sans-serif fonts.
 static FONTS: LazyLock<Arc<fontdb::Database>> = LazyLock::new(|| {
     let mut fonts = fontdb::Database::new();
     fonts.load_font_data(FONT.to_vec());
@@ -34,7 +34,7 @@ pub fn png(drawing: &Drawing) -> crate::Result<Vec<u8>> {
     let tree = Tree::from_str(&drawing.svg(), &options).context("cannot read the SVG of a chart")?;
     #[expect(clippy::cast_possible_truncation, reason = "a chart is a few thousand pixels wide")]
     let [width, height] = drawing.size.map(|units| (units.ceil() as u32) * PIXELS_PER_UNIT);
-    let mut picture = Pixmap::new(width, height).context("a chart has a size")?;
+    let mut picture = Pixmap::new(width, height).context("a chart is empty or too large")?;
     picture.fill(Color::WHITE);
     let scale = PIXELS_PER_UNIT as f32;
     resvg::render(&tree, Transform::from_scale(scale, scale), &mut picture.as_mut());

@@ -1,6 +1,6 @@
-//! `report.html`: the result of training in one file that works offline: test images next to renders, scores, settings.
+//! `report.html`: one page that works offline, with test images next to renders, scores and settings of a training run.
 //!
-//! The page is made from `report.json`, from pictures drawn for it, and from the commands to run next.
+//! The page combines the content of `report.json`, renders of test images, and suggested next commands.
 
 mod pictures;
 
@@ -25,7 +25,7 @@ pub(crate) struct Page<'a> {
     pub folder: &'a Path,
     /// The content of `report.json`.
     pub report: &'a Value,
-    /// Name of the model's primitive, in the singular.
+    /// Singular name of the model's primitive, such as `splat`.
     pub primitive: &'a str,
     pub comparisons: &'a [Comparison],
     pub next: &'a [NextCommand],
@@ -106,7 +106,7 @@ fn figures(done: &Value, primitive: &str) -> String {
         ("depth RMSE", scaled("depth_rmse_m", 1e3, 1), "mm"),
         ("surface error", scaled("surface_error_m", 1e3, 1), "mm"),
         ("surface within 5 mm", scaled("surface_within_5_mm", 1e2, 1), "%"),
-        ("PSNR to the true scene", scaled("psnr_truth", 1.0, 2), "dB"),
+        ("PSNR against truth", scaled("psnr_truth", 1.0, 2), "dB"),
         ("training time", scaled("seconds", 1.0, 1), "s"),
         ("steps", number("steps").map(grouped), ""),
         (primitives.as_str(), number("primitives").map(grouped), ""),
@@ -155,7 +155,7 @@ fn comparison_section(comparisons: &[Comparison], n_tests: usize) -> String {
     }
     let count_note = match comparisons.len() == n_tests {
         true => String::new(),
-        false => format!("{} of {n_tests} test images, with the best and the worst among them. ", comparisons.len()),
+        false => format!("{} of {n_tests} test images, including the best and the worst. ", comparisons.len()),
     };
     let mut html = format!(
         "<h2>Test images</h2>\n<p class=\"legend\">{count_note}Left to right: the camera image and the model's render from \
@@ -197,7 +197,7 @@ fn comparison_card(comparison: &Comparison, tag: &str) -> String {
          <div class=\"stack\">{}{depth}</div></div></article>\n",
         figure(image, "test image"),
         figure(render, "render"),
-        figure(error, "error, bright from 25 %")
+        figure(error, "error, brightest at 25 % or more")
     )
 }
 
@@ -240,7 +240,7 @@ fn scores_of_images(report: &Value) -> Table {
         ("lpips", "LPIPS", 1.0, 4),
         ("depth_rmse_m", "depth RMSE, mm", 1e3, 1),
         ("surface_error_m", "surface, mm", 1e3, 1),
-        ("psnr_truth", "to truth, dB", 1.0, 2),
+        ("psnr_truth", "PSNR against truth, dB", 1.0, 2),
     ];
     table("Scores of all test images", &report["per_image"], ("name", "image"), &columns)
 }
@@ -261,10 +261,10 @@ fn evaluations_table(report: &Value, primitive: &str) -> Table {
     table("Scores during training", &report["evaluations"], ("seconds", "seconds"), &columns)
 }
 
-/// A column: key, head, factor, digits after the point.
+/// A column: key, header, factor, number of decimals.
 type Column<'a> = (&'a str, &'a str, f64, usize);
 
-/// A table of objects, one row each; columns without any value are left out.
+/// A table with one row per object. Columns without any value are left out.
 fn table(title: &str, objects: &Value, (key, head): (&str, &str), columns: &[Column<'_>]) -> Table {
     let objects = array(objects);
     let is_known = |column: &&Column<'_>| objects.iter().any(|object| object[column.0].is_number());
@@ -288,7 +288,7 @@ fn table(title: &str, objects: &Value, (key, head): (&str, &str), columns: &[Col
     }
 }
 
-/// A table: collapsed if it is long, left out if it is empty.
+/// HTML of a table: collapsed if the table is long, nothing if it is empty.
 fn collapsible(table: &Table, title: &str) -> String {
     match table.rows.len() {
         0 => String::new(),
@@ -311,7 +311,7 @@ fn trials(trials: &Value) -> String {
     if rows.is_empty() {
         return String::new();
     }
-    let head = ["tried", "gain, dB", "images", "result"].map(str::to_owned).to_vec();
+    let head = ["candidate", "gain, dB", "images", "result"].map(str::to_owned).to_vec();
     Table { title: "Trials during training".into(), head, rows }.html()
 }
 
@@ -328,7 +328,7 @@ fn settings_table(title: &str, rows: Vec<Vec<String>>, is_collapsed: bool) -> St
     }
 }
 
-/// A value as rows of a table: one row per key for objects, none for empty values.
+/// Table rows for a value: one row per key for objects, none for empty values.
 fn rows_of(key: &str, value: &Value) -> Vec<Vec<String>> {
     let key = match key {
         "n_train" => "training images".to_owned(),
@@ -351,7 +351,7 @@ fn rows_of(key: &str, value: &Value) -> Vec<Vec<String>> {
     }
 }
 
-/// A value in one line.
+/// A value as one line of text.
 fn text_of(value: &Value) -> String {
     let of_map = |map: &Map<String, Value>| {
         let known = map.iter().filter(|(_, value)| !value.is_null());
@@ -370,7 +370,7 @@ fn text_of(value: &Value) -> String {
     }
 }
 
-/// A number with four digits after the point, without trailing zeros.
+/// A number with up to four decimals; in scientific notation if it is very small or large.
 fn short_float(value: f64) -> String {
     if value == 0.0 || (1e-3..1e6).contains(&value.abs()) {
         let text = format!("{value:.4}");
@@ -396,7 +396,7 @@ fn array(value: &Value) -> &[Value] {
     value.as_array().map_or(&[], Vec::as_slice)
 }
 
-/// The settings in the decision log of a folder, which are its first line; `Null` if there is no log.
+/// The settings of a run: the first line of the newest decision log in a folder; `Null` if there is no log.
 pub(crate) fn settings_in(folder: &Path) -> Value {
     let step_of = |name: &str| name.strip_prefix("decisions-from-")?.strip_suffix(".jsonl")?.parse::<u64>().ok();
     let names = std::fs::read_dir(folder).into_iter().flatten().flatten();

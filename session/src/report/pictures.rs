@@ -14,7 +14,7 @@ use trainer::{Method, Picture};
 
 /// Maximum number of test images shown.
 const MAX_IMAGES: usize = 12;
-/// Fraction of the depths that are outside of the range of colors, at each end.
+/// Fraction of the depths that are clipped at each end of the color scale.
 const OUTSIDE_FRAC: f64 = 0.02;
 /// Maximum side of the image and the render.
 const MAX_SIDE_PX: u32 = 640;
@@ -22,11 +22,11 @@ const MAX_SIDE_PX: u32 = 640;
 const MAX_SMALL_SIDE_PX: u32 = 320;
 const QUALITY: u8 = 82;
 const SMALL_QUALITY: u8 = 75;
-/// Maximum bytes of all pictures together, in the encoding of the page.
+/// Maximum total size of all pictures, encoded as base64.
 const MAX_TEXT_BYTES: usize = 2_600_000;
-/// Drawing stops after this time: on a CPU, one picture of a neural field may take half a minute.
+/// After this time, no further picture is drawn. On a CPU, one picture of a neural field may take half a minute.
 const MAX_RENDER_TIME: Duration = Duration::from_secs(10);
-/// Color difference that is drawn brightest, of 255.
+/// Color difference, 0 to 255, from which the error map has its brightest color.
 const MAX_ERROR: u8 = 64;
 
 /// One test image and the model's render of it.
@@ -57,14 +57,14 @@ pub(crate) struct Scored<'a> {
     pub ssim: Option<f64>,
 }
 
-/// Draws test images spread over all of them, including the best and the worst, in the order of `scored`.
+/// Renders an evenly spread selection of test images, including the best and the worst, in the order of `scored`.
 pub(crate) fn compare(method: &mut dyn Method, scored: &[Scored<'_>]) -> crate::Result<Vec<Comparison>> {
     let started = Instant::now();
     let mut comparisons: Vec<(usize, Comparison)> = Vec::new();
     let mut n_bytes = 0;
     for ix in selected(&scored.iter().map(|image| image.psnr).collect::<Vec<_>>()) {
         if !comparisons.is_empty() && started.elapsed() > MAX_RENDER_TIME {
-            log::info!("report.html shows {} test images: drawing more takes too long", comparisons.len());
+            log::info!("report.html shows only {} test images: rendering more takes too long", comparisons.len());
             break;
         }
         let comparison = Comparison::of(method, &scored[ix])?;
@@ -83,7 +83,7 @@ fn selected(psnr: &[f64]) -> Vec<usize> {
     let by_psnr = |a: &usize, b: &usize| psnr[*a].total_cmp(&psnr[*b]);
     let mut selected: Vec<usize> = (0..psnr.len()).min_by(by_psnr).into_iter().collect();
     let n_spread = MAX_IMAGES.saturating_sub(2).max(1);
-    // Images next to each other come late in the order, so that the shown images are spread out wherever drawing stops.
+    // Bit-reversed order, so that the shown images are spread out even if drawing stops early.
     let mut spread: Vec<usize> = (0..n_spread).collect();
     spread.sort_by_key(|n| n.reverse_bits());
     let spread = spread.into_iter().map(|n| n * psnr.len() / n_spread);
@@ -146,12 +146,12 @@ fn fit_size(size_px: [u32; 2], max_side_px: u32) -> [u32; 2] {
     size_px.map(|side| ((f64::from(side) * f64::from(max_side_px) / f64::from(max_side)).round() as u32).max(1))
 }
 
-/// A render over black, as it is scored.
+/// A render over a black background, as in scoring.
 fn opaque(rgba: &[u8]) -> Vec<u8> {
     rgba.as_chunks::<4>().0.iter().flat_map(|[r, g, b, _]| [*r, *g, *b, 255]).collect()
 }
 
-/// Colors of `rgba`; black where the image is masked.
+/// The colors of `rgba`; black where `image` is masked.
 fn mask_colors(rgba: &[u8], image: &[u8]) -> Vec<u8> {
     let pixels = rgba.as_chunks::<4>().0.iter().zip(image.as_chunks::<4>().0);
     pixels.flat_map(|([r, g, b, _], [.., alpha])| if *alpha > 0 { [*r, *g, *b] } else { [0; 3] }).collect()
@@ -161,7 +161,7 @@ fn rgb(rgba: &[u8]) -> Vec<u8> {
     mask_colors(rgba, rgba)
 }
 
-/// The largest channel difference of each pixel, from black over red to light yellow; black where the image is masked.
+/// The largest channel difference of each pixel in the colors of [`heat`]; black where the image is masked.
 fn errors(render: &[u8], image: &[u8]) -> Vec<u8> {
     let pixels = render.as_chunks::<4>().0.iter().zip(image.as_chunks::<4>().0);
     let error = |(render, image): (&[u8; 4], &[u8; 4])| {
@@ -171,7 +171,7 @@ fn errors(render: &[u8], image: &[u8]) -> Vec<u8> {
     pixels.flat_map(error).collect()
 }
 
-/// A color map of rising brightness: black, purple, red, orange, light yellow, evenly spaced.
+/// A color map of increasing brightness: black, purple, red, orange, light yellow, evenly spaced.
 fn heat(value_frac: f32) -> [u8; 3] {
     const STOPS: [[f32; 3]; 5] =
         [[0.0, 0.0, 4.0], [87.0, 16.0, 110.0], [188.0, 55.0, 84.0], [249.0, 142.0, 9.0], [252.0, 255.0, 164.0]];
@@ -197,7 +197,7 @@ fn byte(value: f32) -> u8 {
     value.round().clamp(0.0, 255.0) as u8
 }
 
-/// Samples the values at the pixel centers of a smaller picture. Averages of depth would lie on no surface.
+/// Samples the values at the pixel centers of a smaller picture. Averaging would put depth between surfaces.
 fn nearest_pixels(values: &[f32], from_px: [u32; 2], to_px: [u32; 2]) -> Vec<f32> {
     let source_ix = |ix: u32, from: u32, to: u32| (2 * ix as usize + 1) * from as usize / (2 * to as usize);
     let mut subsampled = Vec::with_capacity(to_px[0] as usize * to_px[1] as usize);

@@ -1,4 +1,4 @@
-//! The end of training: models are saved and scored, and their reports are written.
+//! Ends training: saves and scores models, and writes their reports.
 
 use super::Session;
 use super::outcome::TrainingOutcome;
@@ -36,31 +36,30 @@ impl FinishedModel {
     }
 }
 
-/// One of several sessions that end together, with its output folder and the report details specific to the command.
+/// A session to finish, with its output folder and the command-specific entries of its report.
 pub struct EndingSession<P> {
     /// The session.
     pub session: Session,
     /// Folder for the model and its report.
     pub out: PathBuf,
-    /// Entries of the report besides scores.
+    /// Command-specific entries of the report.
     pub details: P,
 }
 
-/// Saves the models, then scores each one, writes its report, and reports the end. Returns the models so that they can
-/// be shown.
+/// Saves all models, then scores each one and writes its report. Returns the models so that they can be viewed.
 pub fn finish(mut endings: Vec<EndingSession<impl Serialize>>) -> crate::Result<Vec<FinishedModel>> {
     // All models are saved before scoring, so that a second Ctrl-C during scoring loses nothing.
     let ended_secs: Vec<f64> =
         endings.iter_mut().map(|ending| ending.session.stop_training()).collect::<crate::Result<_>>()?;
     let mut saved = Vec::new();
-    // The first error is returned, the others are logged.
+    // The first error is returned, all others are logged.
     let mut failed = Ok(());
     let mut record_error = |error: crate::Error| match failed {
         Ok(()) => failed = Err(error),
         Err(_) => log::error!("{error:#}"),
     };
     for (mut ending, seconds) in endings.into_iter().zip(ended_secs) {
-        // If one model cannot be saved, the others still are.
+        // A model that cannot be saved does not prevent saving the others.
         match ending.session.save(&ending.out, seconds) {
             Ok(Saved { folder, sha256, failed: error }) => {
                 ending.out = folder;
@@ -82,7 +81,7 @@ pub fn finish(mut endings: Vec<EndingSession<impl Serialize>>) -> crate::Result<
         }
     }
     if saved.iter().any(|(ending, ..)| ending.session.stop.requested()) {
-        log::info!("saved; scoring the test images, Ctrl-C again skips this");
+        log::info!("saved; scoring the test images (Ctrl-C again skips this)");
     }
     let mut finished = Vec::new();
     for (EndingSession { session, out, details }, seconds, sha256) in saved {
@@ -98,7 +97,7 @@ pub fn finish(mut endings: Vec<EndingSession<impl Serialize>>) -> crate::Result<
 struct Saved {
     folder: PathBuf,
     sha256: String,
-    /// Error of saving in the run folder, if the model was saved elsewhere.
+    /// Why the model could not be saved in the run folder, if it was saved elsewhere.
     failed: Option<crate::Error>,
 }
 
@@ -117,17 +116,15 @@ impl Session {
         Ok(seconds)
     }
 
-    /// Saves the model after this many seconds of training. If its folder cannot be written, saves it in a temporary
-    /// folder.
+    /// Saves the model, in a temporary folder if `out` cannot be written. `seconds`: training time.
     fn save(&mut self, out: &Path, seconds: f64) -> crate::Result<Saved> {
         self.persistence.end_decisions(self.method.as_mut())?;
         let progress = self.method.progress();
         if progress.step > 0 && progress.primitives == 0 {
             log::warn!("the model is empty: no observation could be used");
         }
-        // Saving ends a trial in progress. The checkpoint holds the state before that, so that a resumed run ends the
-        // trial when it is due. A live run without new keyframes is not finished, because more may come after it is
-        // resumed.
+        // Saving ends a trial in progress. The checkpoint is taken before that, so that a resumed run completes the
+        // trial. An idle live run is not finished, because it may receive more keyframes after it is resumed.
         let is_live = self.persistence.keeps_keyframes();
         let is_finished = self.is_over() || (self.is_idle() && !is_live);
         let (method, keyframes) = (self.method.as_mut(), &self.keyframes[..]);
@@ -142,7 +139,7 @@ impl Session {
         }
     }
 
-    /// Saves the model in a temporary folder, because the folder of its run could not be written.
+    /// Saves the model in a temporary folder, because its run folder could not be written.
     fn save_elsewhere(&mut self, out: &Path, save_error: crate::Error) -> crate::Result<Saved> {
         let save = |method: &mut dyn Method| {
             let folder = run_folder::make_fallback_folder()?;
@@ -168,8 +165,8 @@ impl Session {
         }
     }
 
-    /// Writes the list of camera poses with the model's corrections. Without it, a viewer starts with an outside view
-    /// of the model.
+    /// Writes the list of camera poses with the model's corrections. Without this list, a viewer starts with an outside
+    /// view of the model.
     fn write_cameras(&mut self, out: &Path) {
         let cameras = camera_list::of_model(self.method.as_mut(), &self.keyframes);
         if let Err(error) = camera_list::write(out, &cameras) {
@@ -187,7 +184,7 @@ impl Session {
     ) -> crate::Result<FinishedModel> {
         let outcome = self.score_at_end(seconds)?;
         let method = self.method.as_mut();
-        // Done before profiling, which takes more steps.
+        // Rendered before profiling, because profiling trains the model further.
         let comparisons = self.reporter.compare(method, self.scoreboard.tests(), &outcome.per_image);
         let passes = self.reporter.profile(method)?;
         self.reporter.report_end(ScoredModel {

@@ -1,5 +1,5 @@
-//! What a session keeps so that it can be resumed, replayed, and continued on another device: its checkpoints, its
-//! decision log, and what a restored model needs.
+//! The persistent state of a session: checkpoints for resuming, a decision log for replaying, and data for continuing
+//! on another device.
 
 use crate::checkpoints::{self, CheckpointWrite, Checkpoints, Snapshot};
 use crate::decisions::DecisionLog;
@@ -12,14 +12,14 @@ use trainer::checkpoint::Checkpoint;
 use trainer::gpu::Gpu;
 use trainer::{Method, Resumed};
 
-/// The checkpoints and the decision log of a session, and what a restored model needs.
+/// Checkpoints, decision log and recovery data of a session.
 #[derive(Default)]
 pub(super) struct Persistence {
     checkpoints: Option<Checkpoints>,
     decisions: Option<DecisionLog>,
     recovery: Option<Recovery>,
-    /// Evicted keyframes, without pixels, that the newest checkpoint may contain. The first `n_evicted_before_last` of
-    /// them were evicted before the last checkpoint.
+    /// Evicted keyframes, without pixels, that the newest complete checkpoint may contain. The first
+    /// `n_evicted_before_last` of them were evicted before the last checkpoint was started.
     evicted: Vec<Arc<Keyframe>>,
     n_evicted_before_last: usize,
 }
@@ -56,7 +56,7 @@ impl Persistence {
         Ok(())
     }
 
-    /// Logs that a picture is drawn, because drawing creates splats for new keyframes.
+    /// Logs that a picture is drawn. Drawing affects the result, because it creates splats for new keyframes.
     pub(super) fn log_render(&mut self) {
         if let Some(decisions) = &mut self.decisions {
             decisions.seeded();
@@ -80,7 +80,7 @@ impl Persistence {
         Ok(())
     }
 
-    /// Keeps what identifies an evicted keyframe as long as the newest checkpoint may contain it.
+    /// Keeps an evicted keyframe, without pixels, as long as the newest checkpoint may contain it.
     pub(super) fn evict(&mut self, keyframe: &Keyframe) {
         if self.recovery.is_some() {
             self.evicted.push(Arc::new(without_pixels(keyframe)));
@@ -95,31 +95,31 @@ impl Persistence {
             if let Some(decisions) = &mut self.decisions {
                 decisions.checkpoint(method.n_total_steps()?);
             }
-            // Until this checkpoint is written, the previous one is the newest, and it contains no keyframe that was
-            // evicted before it.
+            // Until this checkpoint is on disk, the previous one is the newest. Neither contains keyframes that were
+            // evicted before the previous one.
             self.evicted.drain(..self.n_evicted_before_last);
             self.n_evicted_before_last = self.evicted.len();
         }
         Ok(())
     }
 
-    /// Whether keyframes are stored with the checkpoints, because a live run has no other copy.
+    /// Whether keyframes are stored with the checkpoints, as in a live run, which has no other copy of them.
     pub(super) fn keeps_keyframes(&self) -> bool {
         self.checkpoints.as_ref().is_some_and(Checkpoints::keeps_keyframes)
     }
 
-    /// Copies the last state for [`Self::write_checkpoint`]. Errors are logged, so that the model is still saved.
+    /// Copies the final state for [`Self::write_checkpoint`]. Errors are only logged, so that the model is still saved.
     pub(super) fn take_last_checkpoint(&mut self, snapshot: Snapshot<'_>) -> Option<CheckpointWrite> {
         match self.checkpoints.as_mut().map(|checkpoints| checkpoints.take(snapshot)).transpose() {
             Ok(checkpoint) => checkpoint,
             Err(error) => {
-                log::warn!("cannot write a checkpoint of the last state: {error:#}");
+                log::warn!("cannot write a checkpoint of the final state: {error:#}");
                 None
             }
         }
     }
 
-    /// Writes a copy of the last state on a separate thread.
+    /// Writes a copy of the final state on a separate thread.
     pub(super) fn write_checkpoint(&mut self, checkpoint: Option<CheckpointWrite>) {
         if let (Some(checkpoints), Some(checkpoint)) = (&mut self.checkpoints, checkpoint) {
             checkpoints.write(checkpoint);
@@ -136,13 +136,13 @@ impl Persistence {
         self.recovery.is_some()
     }
 
-    /// What can be continued if the run fails now, as a sentence without a period; `None` without recovery.
+    /// Describes how to continue if the run fails now, as a sentence without a period; `None` without recovery.
     pub(super) fn describe_recoverable(&mut self) -> Option<String> {
         let has_checkpoint = self.has_checkpoint();
         Some(self.recovery.as_ref()?.describe_recoverable(has_checkpoint))
     }
 
-    /// What to continue from if the model could not be saved, as a clause for an error message.
+    /// Describes how to continue if the model could not be saved, as a clause for an error message.
     pub(super) fn describe_unsaved(&mut self) -> String {
         match self.describe_recoverable() {
             Some(left) if self.has_checkpoint() => format!("{left}; use --out to save the model in another folder"),
@@ -156,8 +156,8 @@ impl Persistence {
         self.checkpoints.as_mut().is_some_and(|checkpoints| checkpoints.newest().is_some())
     }
 
-    /// Restores the model with these keyframes on another device, from the newest checkpoint or, without one, from the
-    /// start. Begins a new decision log.
+    /// Restores the model with these keyframes on another device, from the newest checkpoint or else from scratch.
+    /// Begins a new decision log.
     pub(super) fn restore(&mut self, gpu: &Arc<Gpu>, keyframes: &[Arc<Keyframe>]) -> crate::Result<Box<dyn Method>> {
         let Some(recovery) = &self.recovery else { keyframe::bail!("this run cannot continue on another device") };
         let written = self.checkpoints.as_mut().and_then(Checkpoints::newest).map(Path::to_owned);
@@ -182,7 +182,7 @@ impl Persistence {
             method.remove(&keyframe.camera, keyframe.stamp)?;
         }
         let from_step = method.n_total_steps()?;
-        // The current log belongs to a run that ended here. A new log begins, possibly in the same file.
+        // The current log ends here. The new log may have the same file name and then replaces it.
         if let Some(decisions) = self.decisions.take() {
             decisions.close_unfinished();
         }
@@ -204,7 +204,7 @@ impl Persistence {
     }
 }
 
-/// Resumes a model from a checkpoint that may be unreadable; `None` if that fails for another reason than the GPU.
+/// Resumes a model from a checkpoint. Returns `None` if the checkpoint cannot be used, and an error if the GPU failed.
 fn resume(
     gpu: &Arc<Gpu>,
     checkpoint: crate::Result<Checkpoint>,
@@ -220,7 +220,7 @@ fn resume(
     }
 }
 
-/// A keyframe without pixels, with all the data by which a checkpoint identifies it.
+/// A copy of a keyframe without pixels, with all data that identifies the keyframe in a checkpoint.
 fn without_pixels(keyframe: &Keyframe) -> Keyframe {
     let depth = keyframe.depth.as_ref().map(|depth| DepthMap { depth_m: [].into(), ..depth.clone() });
     Keyframe { rgba_srgb: [].into(), depth, truth: None, ..keyframe.clone() }

@@ -6,9 +6,9 @@ use std::time::{Duration, Instant};
 use trainer::Method;
 use trainer::gpu::PassTiming;
 
-/// Number of steps in a profile, which reports medians.
+/// Number of profiled steps, over which medians are taken.
 const N_PROFILED: usize = 21;
-/// Drivers are slow for a while after large buffers have been freed.
+/// Warm-up time, because drivers are slow for a while after large buffers were freed.
 const PROFILE_WARM_UP: Duration = Duration::from_millis(700);
 
 /// GPU time of each kernel in a step in milliseconds: medians over [`N_PROFILED`] steps, in order of first execution.

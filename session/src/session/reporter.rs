@@ -37,13 +37,13 @@ struct NamedScores<'a> {
     scores: &'a ImageScores,
 }
 
-/// A model that was saved and scored, and the other contents of its report.
+/// A saved and scored model, and the other contents of its report.
 pub(super) struct ScoredModel<'a, T: Serialize> {
     /// Folder of the model.
     pub out: &'a Path,
     pub checkpoint_sha256: &'a str,
     pub outcome: &'a TrainingOutcome,
-    /// Test images next to renders; without them, the page is not written.
+    /// Test images next to renders. If this is an error, the page is not written.
     pub comparisons: crate::Result<Vec<report::Comparison>>,
     /// GPU time of each kernel in a step in milliseconds, if profiling was requested.
     pub passes: Option<Vec<(&'static str, f64)>>,
@@ -51,7 +51,7 @@ pub(super) struct ScoredModel<'a, T: Serialize> {
     pub trials: Vec<TrialReport>,
     /// The GPU adapter and its driver.
     pub adapter: String,
-    /// Entries of the report specific to the command.
+    /// Command-specific entries of the report.
     pub details: &'a T,
 }
 
@@ -67,7 +67,7 @@ pub(super) struct Reporter {
 }
 
 impl Reporter {
-    /// Reports to an observer on a model of this kind.
+    /// A reporter on a model of this kind that sends events to `observer`.
     pub(super) fn new(kind: ModelKind, observer: Box<dyn Observer>) -> Self {
         Self { kind, data: DataSource::default(), observer, profiles: false, evaluations: Vec::new() }
     }
@@ -131,7 +131,7 @@ impl Reporter {
         self.observer.on_event(&SessionEvent::TrainingEnded);
     }
 
-    /// Renders test images for the report. `scores` belong to the test images, in the same order.
+    /// Renders test images for the report. `scores` has one entry per test image, in the same order.
     pub(super) fn compare<'a>(
         &self,
         method: &mut dyn Method,
@@ -152,7 +152,7 @@ impl Reporter {
         self.profiles.then(|| profile(method)).transpose()
     }
 
-    /// Writes the report of a saved model, and reports the end.
+    /// Writes the report of a saved model and sends the final event.
     pub(super) fn report_end(&mut self, model: ScoredModel<'_, impl Serialize>) -> crate::Result<()> {
         let ScoredModel { out, outcome, .. } = model;
         let done = DoneEvent {
@@ -185,7 +185,7 @@ impl Reporter {
         let primitive = self.kind.entry().primitive;
         let finished = FinishedReport { done: &done, profile, primitive, has_page: page.is_ok() };
         self.observer.on_event(&SessionEvent::Finished(&finished));
-        written.with_context(|| format!("the model was saved in {}, but its report was not", out.display()))
+        written.with_context(|| format!("the model was saved in {}, but not its report", out.display()))
     }
 
     /// Writes the HTML page of the report.

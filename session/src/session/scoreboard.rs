@@ -1,4 +1,4 @@
-//! The scores of a session: its test keyframes, when and how they are scored, and the PSNR so far.
+//! The test keyframes of a session, their evaluation schedule, and their scores so far.
 
 use crate::evaluate::{Evaluator, ImageScores};
 use crate::evaluation_schedule::EvaluationSchedule;
@@ -15,9 +15,9 @@ const MAX_HISTORY: usize = 512;
 /// How a session is evaluated.
 #[derive(Clone)]
 pub struct Evaluators {
-    /// Evaluator for scheduled evaluations: thorough in `train`, quick in a live run.
+    /// Evaluator for scheduled evaluations: all scores in `train`, PSNR only in a live run.
     pub during_training: Evaluator,
-    /// Maximum number of test keyframes in a scheduled evaluation, spread evenly over all. All are scored at the end.
+    /// Maximum number of test keyframes in a scheduled evaluation, evenly spread. The final evaluation scores all.
     pub max_images_during_training: usize,
     /// Evaluator for the end of training.
     pub at_end: Evaluator,
@@ -26,7 +26,7 @@ pub struct Evaluators {
 /// Test keyframes and their scores.
 pub(super) struct Scoreboard {
     evaluators: Evaluators,
-    /// The one whose score is oldest comes first.
+    /// Test keyframes, those with the oldest score first.
     tests: VecDeque<Arc<Keyframe>>,
     schedule: EvaluationSchedule,
     /// An evaluation that is due or in progress.
@@ -52,7 +52,7 @@ impl Scoreboard {
         }
     }
 
-    /// Leaves it to the caller to score an evaluation image by image.
+    /// Makes the caller score each evaluation, image by image.
     pub(super) fn set_stepwise(&mut self) {
         self.is_stepwise = true;
     }
@@ -62,7 +62,7 @@ impl Scoreboard {
         self.is_stepwise
     }
 
-    /// Skips the evaluations of earlier training.
+    /// Skips the evaluations up to the training time of earlier runs.
     pub(super) fn skip_until(&mut self, previous_secs: f64) {
         self.schedule.reached(previous_secs);
     }
@@ -107,7 +107,7 @@ impl Scoreboard {
         self.pending.is_some()
     }
 
-    /// Takes the evaluation in progress; it is aborted unless it is returned to [`Self::continue_with`].
+    /// Takes the evaluation in progress. It is aborted unless it is returned with [`Self::continue_with`].
     pub(super) fn take_pending(&mut self) -> Option<PendingEvaluation> {
         self.pending.take()
     }
@@ -127,7 +127,7 @@ impl Scoreboard {
         self.evaluators.at_end.score_all(method, self.tests.iter())
     }
 
-    /// The test keyframe whose score is oldest, which counts as scored from now on.
+    /// Returns the test keyframe with the oldest score and moves it to the end of the queue.
     pub(super) fn next_to_refresh(&mut self) -> Option<Arc<Keyframe>> {
         let oldest = self.tests.pop_front()?;
         self.tests.push_back(oldest.clone());

@@ -1,4 +1,4 @@
-//! Scoring image by image gives the same result as scoring all at once.
+//! Checks that scoring image by image gives the same result as scoring all images at once.
 
 use super::*;
 use calibration::{CalibratedCamera, TrialReport};
@@ -107,7 +107,7 @@ fn test_keyframe(ix: u8) -> Arc<Keyframe> {
     })
 }
 
-/// A session of one second with an evaluation due, and the counter of its pictures.
+/// A session after one second of training, with an evaluation due, and the counter of its pictures.
 fn session_with_evaluation_due(stop: &Stop) -> (Session, std::rc::Rc<std::cell::Cell<u32>>) {
     let method = Gray::default();
     let n_drawn = method.n_drawn.clone();
@@ -141,7 +141,7 @@ fn stepwise_scoring_equals_scoring_at_once() {
     stepwise.evaluate_when_due().expect("opened");
     assert!(
         stepwise.is_scoring() && stepwise.reporter.evaluations().is_empty() && n_drawn.get() == 0,
-        "the caller scores"
+        "images are scored only by score_next"
     );
     for n in 1..=3 {
         assert!(stepwise.is_scoring());
@@ -153,7 +153,7 @@ fn stepwise_scoring_equals_scoring_at_once() {
     assert_eq!((one.n_images, one.step), (3, 1));
     assert_eq!((other.n_images, other.step), (3, 1));
     assert!(one.scores == other.scores && one.scores.psnr.is_some());
-    assert!((other.seconds - 1.0).abs() < 0.9, "{} s: when the evaluation was due", other.seconds);
+    assert!((other.seconds - 1.0).abs() < 0.9, "{} s, expected the time when it was due", other.seconds);
     assert!(stepwise.psnr() == at_once.psnr());
     stepwise.score_next().expect("nothing to do");
     assert_eq!((stepwise.reporter.evaluations().len(), n_drawn.get()), (1, 3));

@@ -1,14 +1,14 @@
-//! The time of a session: its clock, when to stop training, and the time that it has used a shared device.
+//! Time accounting of a session: training time, its limits, and the use of a shared device.
 
 use crate::clock::Clock;
 use std::time::{Duration, Instant};
 
-/// When to stop training.
+/// Limits of training, which stops when the first one is reached.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Limits {
-    /// Seconds on the session's clock.
+    /// Maximum training time, seconds.
     pub seconds: Option<f64>,
-    /// Number of optimizer updates.
+    /// Maximum number of optimizer steps.
     pub steps: Option<u64>,
 }
 
@@ -25,9 +25,9 @@ impl Limits {
 pub(super) struct TrainingTime {
     limits: Limits,
     clock: Clock,
-    /// Time that this session has used a shared device.
+    /// Time for which this session has used a shared device.
     device_time: Duration,
-    /// Training time at which this session was finished while others continued, seconds.
+    /// Training time at which this session finished, seconds; other sessions may still train.
     finished_secs: Option<f64>,
 }
 
@@ -47,7 +47,7 @@ impl TrainingTime {
         self.clock.start(at);
     }
 
-    /// Time at which the clock was started, if it was.
+    /// Time at which the clock was started; `None` if it is not running.
     pub(super) fn started(&self) -> Option<Instant> {
         self.clock.started()
     }
@@ -57,27 +57,27 @@ impl TrainingTime {
         self.clock.secs()
     }
 
-    /// Excludes this much from the training time.
+    /// Excludes a duration from the training time.
     pub(super) fn exclude(&self, spent: Duration) {
         self.clock.exclude(spent);
     }
 
-    /// Whether a limit was reached after this many steps.
+    /// Whether a limit is reached after `n_steps` steps.
     pub(super) fn is_over(&self, n_steps: u64) -> bool {
         self.limits.seconds.is_some_and(|secs| self.secs() >= secs) || self.has_finished_steps(n_steps)
     }
 
-    /// Number of steps left after this many; `None` without a step limit.
+    /// Number of steps left after `n_steps` steps; `None` without a step limit.
     pub(super) fn n_steps_remaining(&self, n_steps: u64) -> Option<u64> {
         Some(self.limits.steps?.saturating_sub(n_steps))
     }
 
-    /// Whether the step limit was reached after this many steps.
+    /// Whether the step limit is reached after `n_steps` steps.
     pub(super) fn has_finished_steps(&self, n_steps: u64) -> bool {
         self.n_steps_remaining(n_steps) == Some(0)
     }
 
-    /// Time that this session has used a shared device.
+    /// Time for which this session has used a shared device.
     pub(super) fn device_time(&self) -> Duration {
         self.device_time
     }
@@ -87,12 +87,12 @@ impl TrainingTime {
         self.device_time += spent;
     }
 
-    /// Raises the device time to at least this.
+    /// Raises the device time to at least `device_time`.
     pub(super) fn raise_device_time(&mut self, device_time: Duration) {
         self.device_time = self.device_time.max(device_time);
     }
 
-    /// Marks the session as finished at the current training time, unless it already is.
+    /// Marks the session as finished at the current training time, unless it is already finished.
     pub(super) fn mark_finished(&mut self) {
         let secs = self.secs();
         self.finished_secs.get_or_insert(secs);
@@ -103,12 +103,12 @@ impl TrainingTime {
         self.finished_secs.is_some()
     }
 
-    /// Continues a session that may have been finished.
+    /// Removes the mark of a finished session, so that it continues.
     pub(super) fn unmark_finished(&mut self) {
         self.finished_secs = None;
     }
 
-    /// Training time at the end: when the session was finished, or now. Seconds.
+    /// Training time at which the session finished, or the current one if it has not finished, seconds.
     pub(super) fn end_secs(&self) -> f64 {
         self.finished_secs.unwrap_or_else(|| self.secs())
     }

@@ -11,12 +11,12 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-/// Ranges of the Damiao counts: rad, rad/s and Nm, those of a DM4310.
+/// Encoding ranges of a Damiao DM4310: rad, rad/s and Nm.
 const DAMIAO_LIMITS: Limits = Limits::of(12.5, 30.0, 10.0);
 /// Time to wait for messages on a bus before servicing motors that report periodically.
 const RECEIVE_TIMEOUT: Duration = Duration::from_millis(1);
 
-/// Motors that respond until they are dropped.
+/// Motors that reply until they are dropped.
 #[derive(Debug)]
 pub struct EmulatedMotors {
     flags: Arc<SharedFlags>,

@@ -1,7 +1,7 @@
 //! Emulates the devices of a recorded rig on the wire: a Franka controller, motors on CAN buses, datagrams.
 //!
-//! A previously simulated rig is a [`DeviceScript`]. [`PlaybackClock`] maps its stamps to playback times. Images are
-//! not played back here; use a recording of the camera vendor's library.
+//! A [`DeviceScript`] holds the samples of a simulated or recorded rig. [`PlaybackClock`] maps their stamps to playback
+//! times. Images are not played back here; play back a file of the camera vendor's library instead.
 
 #[cfg(target_os = "linux")]
 mod can;
@@ -19,10 +19,10 @@ use drivers::{BasePose, RangeScan, Sample};
 use kinematics::{HistoryError, JointHistory, JointState, Stamp};
 use std::time::Duration;
 
-/// Joint readings of a script farther apart than this are not interpolated.
+/// Joint readings are not interpolated across gaps longer than this.
 const MAX_GAP: Duration = Duration::from_secs(1);
 
-/// Samples of the devices of a rig, except its cameras, each in stamp order.
+/// Samples of all devices of a rig except cameras, each list in stamp order.
 #[derive(Clone, Debug, Default)]
 pub struct DeviceScript {
     /// Joint readings.
@@ -93,7 +93,7 @@ impl JointTrack {
         let state = match self.history.at(scripted) {
             Ok(state) => state,
             Err(_) if scripted < first.stamp => first.clone(),
-            // Past the end, or in a gap, which a simulation does not have.
+            // After the end, or in a gap. Simulated scripts have no gaps.
             Err(_) => last.clone(),
         };
         JointState { stamp: now, ..state }

@@ -13,7 +13,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-/// Maximum echoes per datagram. As JSON, each takes about 60 bytes, and 65 507 bytes fit.
+/// Maximum echoes per datagram. Each takes about 60 bytes as JSON; a datagram holds at most 65 507 bytes.
 const MAX_POINTS: usize = 1000;
 /// Period at which the state at rest is resent.
 const RESEND_PERIOD: Duration = Duration::from_millis(20);
@@ -31,7 +31,7 @@ pub struct DatagramTargets {
     pub scanners: Vec<(String, SocketAddr)>,
 }
 
-/// A thread that sends until it is dropped.
+/// A thread that sends datagrams until this value is dropped.
 #[derive(Debug)]
 pub struct EmulatedSenders {
     stop: Arc<AtomicBool>,
@@ -39,8 +39,8 @@ pub struct EmulatedSenders {
 }
 
 impl EmulatedSenders {
-    /// Starts sending: the script during playback; before and after it, joints and base at rest at its first and last
-    /// state.
+    /// Starts sending. Before and after the playback, joints and base are at rest in the first and last state of the
+    /// script.
     pub fn start(
         script: &DeviceScript,
         playback_clock: PlaybackClock,
@@ -208,7 +208,7 @@ impl Sender {
     }
 
     fn send(&self, bytes: &[u8], to: SocketAddr) {
-        // There may be no receiver yet, or no longer.
+        // Sending may fail while there is no receiver.
         let _ = self.socket.send_to(bytes, to);
     }
 }

@@ -44,7 +44,7 @@ impl Args {
             return print::json(row);
         }
         print::line(format_args!(
-            "{} rays {:>8} samples: step {:.3} ms (wall {:.3}), rendering as many samples {:.3} ms, peak {} MB",
+            "{} rays {:>8} samples: step {:.3} ms (wall {:.3}), rendering {:.3} ms, peak {} MB",
             row.rays,
             row.samples,
             row.step_millis,

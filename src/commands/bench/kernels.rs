@@ -18,14 +18,14 @@ pub(crate) struct Args {
     /// Image sizes, `WIDTHxHEIGHT`, separated by commas [default: 1024x1024,1280x720,1920x1080; without a GPU 320x240]
     #[arg(long, value_delimiter = ',', value_parser = parse_size)]
     size: Vec<Size>,
-    /// Numbers of splats, 1 to 100000000, separated by commas; with --cloud, that of the file
-    /// [default: 100000,300000,1000000,3000000; without a GPU 10000,30000]
+    /// Numbers of splats, 1 to 100000000, separated by commas; cannot be combined with --cloud [default:
+    /// 100000,300000,1000000,3000000; without a GPU 10000,30000]
     #[arg(long, value_delimiter = ',', conflicts_with = "cloud", value_parser = clap::value_parser!(u32).range(1..=MAX_CLOUD_SPLATS))]
     splats: Vec<u32>,
     /// Number of timed images and steps, 1 to 10000; the median is reported [default: 30; without a GPU 3]
     #[arg(long, value_parser = clap::value_parser!(u32).range(1..=10_000))]
     repeats: Option<u32>,
-    /// Put the camera into the middle of the cloud, where it sees only some of the splats
+    /// Put the camera in the middle of the cloud, where only some of the splats are visible
     #[arg(long)]
     inside: bool,
     /// Print the GPU time of each pass of a step

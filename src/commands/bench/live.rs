@@ -105,7 +105,7 @@ impl Args {
         right.chain(wrong).collect()
     }
 
-    /// One run, whose folder is removed at its end.
+    /// Measures one run, then removes its folder.
     fn measure(&self, rig: &Rig, conditions: Conditions) -> anyhow::Result<LiveRun> {
         let folder = self.out.join(format!("run-{}", std::process::id()));
         std::fs::create_dir_all(&folder).with_context(|| format!("cannot create {}", folder.display()))?;
@@ -152,7 +152,7 @@ mod tests {
     }
 
     #[test]
-    fn each_number_of_viewers_and_each_direction_is_a_run() {
+    fn every_viewer_count_and_direction_is_one_run() {
         let line = [
             "live",
             "scan.mcap",

@@ -15,7 +15,7 @@ use std::time::{Duration, Instant};
 
 /// Maximum time between two lines on stdout.
 const PRINT_PERIOD: Duration = Duration::from_secs(60);
-/// Charts and numbers are written this often, so that an interrupted bench leaves results.
+/// Charts and numbers are written with this period, so that an interrupted bench leaves results.
 const WRITE_PERIOD: Duration = Duration::from_secs(60);
 const BYTES_PER_MB: f64 = 1e6;
 
@@ -53,7 +53,7 @@ pub(crate) struct Args {
 pub(super) fn run(args: &Args) -> anyhow::Result<Exit> {
     args.check()?;
     std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
-    // Checkpoints are part of a run, so they are written, and removed afterwards with their folder.
+    // Checkpoints are part of a run, so they are written here, too. Their folder is removed afterwards.
     let run_folder = args.out.join(format!("run-{}", std::process::id()));
     let measured = args.run_flags(&run_folder).map_err(Into::into).and_then(|flags| measure(args, &flags));
     if run_folder.exists()
@@ -71,7 +71,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Exit> {
     }
 }
 
-/// The measurements of a run, and the error that ended its devices early.
+/// Returns the measurements of a run, and the device error that ended it early, if any.
 fn measure(args: &Args, flags: &run::Args) -> anyhow::Result<(MemoryRun, Option<drivers::Error>)> {
     let mut running = run::start(flags, None, &mut CreatedFolders::default())?;
     let address = running.server.address();

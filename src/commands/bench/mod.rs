@@ -38,7 +38,7 @@ enum BenchCommand {
     Stability(stability::Args),
     /// Errors of image stamps with jitter and clock drift, as a histogram
     Stamps(stamps::Args),
-    /// A live run as an operator sees it: latency of pictures, shutter to model, and PSNR over time with right and wrong
+    /// Live runs with viewers: latency of pictures, time from shutter to model, and PSNR over time with right and wrong
     /// calibration
     Live(live::Args),
     /// Memory use of a long run by component, and its growth rate once the keyframe store is full

@@ -13,7 +13,7 @@ struct RunFlags {
     args: run::Args,
 }
 
-/// Parses the flags of a run that writes to `out` and serves its page at a free port of this computer.
+/// Parses the flags of a run that writes to `out` and serves its page on a free port of this computer.
 ///
 /// * `given`: the flags that the user gave for the run.
 pub(super) fn parse(

@@ -18,7 +18,7 @@ pub(crate) struct Args {
     /// single disturbance
     #[arg(long, value_name = "N,...", value_delimiter = ',')]
     levels: Vec<f64>,
-    /// Images per second of a folder without times; clock-offset needs it then
+    /// Image rate of a folder without time stamps, Hz; required there for clock-offset
     #[arg(long, value_name = "HZ")]
     rate_hz: Option<f64>,
     /// Training time of each run in seconds; loading and scoring do not count [default: 30, unless --steps is given]
@@ -38,7 +38,7 @@ pub(crate) struct Args {
 enum DisturbanceArg {
     /// Errors of training poses: 0 to 50 mm and 0 to 5 degrees
     PoseNoise,
-    /// Poses of a time that is 0 to 200 ms later
+    /// Poses from 0 to 200 ms after the image stamps
     ClockOffset,
     /// Exposure step of 0 to 1 EV in the middle of the capture
     Exposure,

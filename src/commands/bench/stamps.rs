@@ -21,10 +21,10 @@ pub(crate) struct Args {
     /// How much faster this computer's clock runs than the camera's, parts per million
     #[arg(long, value_name = "PPM", default_value_t = 50.0, allow_hyphen_values = true)]
     drift_ppm: f64,
-    /// Length of a run
+    /// Length of a run in seconds
     #[arg(long, value_name = "S", default_value_t = 120.0)]
     seconds: f64,
-    /// Time at the start of a run that is not counted
+    /// Seconds at the start of a run that are not counted
     #[arg(long, value_name = "S", default_value_t = 10.0)]
     settle_seconds: f64,
     /// Runs per rate

@@ -1,4 +1,4 @@
-//! The GPU.
+//! Checks the GPU.
 
 use crate::open_gpu::open_gpu;
 use capture::doctor::Finding;

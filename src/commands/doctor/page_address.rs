@@ -1,4 +1,4 @@
-//! The address of the page.
+//! Checks the address of the page.
 
 use capture::doctor::Finding;
 use std::net::TcpListener;

@@ -1,4 +1,4 @@
-//! Writes the images of a recording as files of a RealSense camera.
+//! Writes the images of a recording to RealSense bag files.
 
 use anyhow::Context;
 use capture::config::{Camera, CameraDriver, Rig};
@@ -25,7 +25,7 @@ struct CameraFile {
 impl CameraFiles {
     /// Creates an entry for each RealSense camera of the rig.
     pub(super) fn new(rig: &Rig, folder: &Path) -> anyhow::Result<Self> {
-        let folder = std::path::absolute(folder).context("the folder of the cameras' files")?;
+        let folder = std::path::absolute(folder).context("cannot resolve the folder of the camera files")?;
         let camera_file = |camera: &Camera| CameraFile {
             camera: camera.clone(),
             path: folder.join(format!("{}.bag", camera.name)),
@@ -44,7 +44,8 @@ impl CameraFiles {
         }
     }
 
-    /// Finishes the files and sets them in the rig, paced by the clock; returns a description of each.
+    /// Finishes the files and sets them as the files of the rig's cameras, paced by the clock. Returns a description of
+    /// each.
     pub(super) fn finish(self, rig: &mut Rig) -> anyhow::Result<Vec<String>> {
         let mut descriptions = Vec::new();
         for camera_file in self.camera_files {
@@ -64,7 +65,7 @@ impl CameraFile {
         let image = if image.is_depth() {
             image
         } else {
-            // RealSense cameras send uncompressed images; those of recordings are compressed.
+            // RealSense cameras send uncompressed images, but recordings contain compressed ones.
             Image { data: image.decode_rgb()?.into(), format: PixelFormat::Rgb8, ..image }
         };
         match &mut self.writer {

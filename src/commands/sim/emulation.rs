@@ -25,7 +25,7 @@ const SIMULATION_FILE: &str = "script.mcap";
 /// How often Ctrl-C is checked.
 const POLL: Duration = Duration::from_millis(50);
 
-/// Scenes that include a rig file whose devices are on the wire.
+/// Scenes with a bundled rig file for emulated devices.
 const SCENES: [(&str, &str, &str); 2] = [
     ("static-arm", include_str!("../../../rigs/wire/static-arm.toml"), include_str!("../../../rigs/robots/panda.urdf")),
     (
@@ -115,7 +115,7 @@ fn load(rig_or_scene: &str) -> anyhow::Result<(String, Rig)> {
     Ok((name, Rig::load(path, &[])?))
 }
 
-/// Rejects a rig that cannot be emulated before it is simulated for a minute.
+/// Rejects a rig that cannot be emulated, before a minute is spent on its simulation.
 fn check(rig: &Rig) -> Result<(), BadArgument> {
     if rig.arm.driver == ArmDriver::Sim {
         return Err(BadArgument(
@@ -200,7 +200,7 @@ fn write_rig(folder: &Path, rig: &Rig) -> anyhow::Result<PathBuf> {
     Ok(path)
 }
 
-/// Devices that respond until they are dropped.
+/// Devices that reply until they are dropped.
 struct EmulatedDevices {
     _robot: Option<EmulatedRobot>,
     _motors: Option<EmulatedMotors>,
@@ -211,7 +211,7 @@ struct EmulatedDevices {
 
 impl EmulatedDevices {
     fn start(rig: &Rig, script: &DeviceScript, playback_clock: PlaybackClock, args: &Args) -> anyhow::Result<Self> {
-        let track = || JointTrack::new(&script.joints, playback_clock).context("the joint states");
+        let track = || JointTrack::new(&script.joints, playback_clock).context("cannot play back the joint states");
         let (mut robot, mut motors) = (None, None);
         let mut datagram_targets = DatagramTargets::default();
         let mut descriptions = Vec::new();
@@ -262,7 +262,7 @@ fn robot_config(rig: &Rig, fci: &str) -> anyhow::Result<RobotConfig> {
     Ok(RobotConfig { address, version, chain, flange_from_tool: Transform::identity(), limits })
 }
 
-/// Address at which a controller listens; it must be one of this computer.
+/// Address at which the emulated controller listens; it must belong to this computer.
 fn fci_address(text: &str) -> anyhow::Result<SocketAddr> {
     let found = match text.parse() {
         Ok(address) => Some(address),
@@ -314,7 +314,7 @@ mod tests {
             for (camera, on_wire) in plain.cameras.iter_mut().zip(&wire.cameras) {
                 camera.driver = on_wire.driver;
                 camera.stamp_to_mid_exposure = on_wire.stamp_to_mid_exposure.clone();
-                // Wire rig files omit what a RealSense camera reports itself.
+                // Rig files for emulated devices omit values that a RealSense camera reports.
                 camera.realsense = on_wire.realsense.clone();
             }
             assert!(plain == wire, "{name}");

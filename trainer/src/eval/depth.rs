@@ -23,10 +23,10 @@ pub fn depth_rmse_m(rendered_m: &[f32], truth_m: &[f32]) -> Result<Option<f64>, 
 /// Distance of a rendered surface from a measured one.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SurfaceError {
-    /// Mean distance along the measured surface's normal, over measured pixels that are rendered, meters; `None` if
-    /// none is.
+    /// Mean distance along the normal of the measured surface, meters, over measured pixels with a rendered depth;
+    /// `None` if there are none.
     pub mean_m: Option<f64>,
-    /// Fraction of the measured pixels where the rendered surface is within [`SurfaceError::NEAR_M`].
+    /// Fraction of the measured pixels whose rendered surface is within [`SurfaceError::NEAR_M`].
     pub near_frac: f64,
 }
 
@@ -35,11 +35,10 @@ impl SurfaceError {
     pub const NEAR_M: f64 = 0.005;
 }
 
-/// Distance of a surface, rendered as depth in meters of the same camera, from a measured one.
+/// Distance of a rendered surface from a measured one; both are depth images of the same camera, meters.
 ///
-/// Only measured pixels with a known surface normal count: those with a reading on each side along both axes, none of
-/// which differs by more than 4 % (an edge). Returns `None` if there is no such pixel; fails if the images differ in
-/// size.
+/// Only measured pixels with a known surface normal count: all four neighbors must have a reading, and none may differ
+/// by more than 4 % (an edge). Returns `None` if there is no such pixel. Fails if the images differ in size.
 pub fn surface_error(rendered_m: &[f32], measured: &DepthMap) -> Result<Option<SurfaceError>, Error> {
     const EDGE_FRAC: f64 = 0.04;
     let [width, height] = measured.size_px;
@@ -129,7 +128,7 @@ mod tests {
         depth_m[20 * 40 + 7] = 0.0;
         let truth = measured(depth_m.clone());
         let near_frac = |rendered: &[f32]| surface_error(rendered, &truth).unwrap().unwrap().near_frac;
-        // 28 rows minus two at the edge, of 38 pixels; five are on or next to the hole.
+        // 28 rows of 38 pixels, minus two rows at the edge, minus five pixels on or next to the hole.
         let n = 26.0 * 38.0 - 5.0;
         let mut rendered = depth_m.clone();
         rendered[10 * 40 + 10] = 3.0;

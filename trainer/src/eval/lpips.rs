@@ -6,14 +6,14 @@ use candle_core::{Device, Tensor};
 use std::collections::HashMap;
 use std::path::Path;
 
-/// Minimum side length, pixels: the weights were fitted to patches of this size.
+/// Minimum side length, pixels: the size of the patches to which the weights were fitted.
 const MIN_SIDE_PX: u32 = 64;
 /// Channel means and standard deviations of the inputs, which are between -1 and 1.
 const CHANNEL_MEAN: [f32; 3] = [-0.030, -0.088, -0.188];
 const CHANNEL_DEVIATION: [f32; 3] = [0.458, 0.448, 0.450];
 /// Keeps the normalization of an all-zero feature finite.
 const EPSILON: f64 = 1e-10;
-/// Stages of the network; features are compared at the end of each. `true`: halve the size before the fire module.
+/// Stages of the network; features are compared after each stage. `true`: halve the size before the fire module.
 const STAGES: [&[(usize, bool)]; 6] =
     [&[(3, true), (4, false)], &[(6, true), (7, false)], &[(9, true)], &[(10, false)], &[(11, false)], &[(12, false)]];
 
@@ -49,7 +49,7 @@ impl Lpips {
         Ok(Self { first: Convolution::of(&tensors, "features.0")?, stages, channel_weights })
     }
 
-    /// The distance of the two pictures; masked pixels are mid-gray in both.
+    /// The distance between two pictures. Masked pixels are mid-gray in both.
     ///
     /// Fails for pictures with a side below 64 pixels, and if all pixels are masked.
     pub fn distance(&self, pair: &PixelPair<'_>) -> Result<f64, Error> {
@@ -121,7 +121,7 @@ impl Convolution {
     }
 }
 
-/// The fire module of `SqueezeNet`: a convolution to few channels, then small and large windows in parallel.
+/// The fire module of `SqueezeNet`: a 1x1 convolution to few channels, then 1x1 and 3x3 convolutions in parallel.
 #[derive(Debug)]
 struct Fire {
     halve: bool,

@@ -18,7 +18,7 @@ use crate::Error;
 
 /// Two pictures of equal size to be compared, `[height, width, 4]`, 8-bit sRGB.
 ///
-/// Only pixels where the truth's alpha is not 0 count. The alpha of the rendered picture is ignored.
+/// Pixels whose alpha in the truth is 0 are masked and do not count. The alpha of the rendered picture is ignored.
 #[derive(Clone, Copy, Debug)]
 pub struct PixelPair<'a> {
     size_px: [u32; 2],

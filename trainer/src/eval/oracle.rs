@@ -8,9 +8,9 @@ use std::path::Path;
 
 /// Both implementations compute the same integers.
 const PSNR_TOLERANCE_DB: f64 = 1e-6;
-/// Ours blurs in f32; the reference in f64 agrees to a few 1e-6.
+/// Our metric blurs in f32; the f64 reference agrees to a few 1e-6.
 const SSIM_TOLERANCE: f64 = 1e-4;
-/// The order of summation through 26 convolutions in f32 differs.
+/// 26 convolutions in f32 sum in a different order.
 #[cfg(feature = "lpips")]
 const LPIPS_TOLERANCE: f64 = 1e-4;
 

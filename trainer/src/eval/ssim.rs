@@ -21,7 +21,7 @@ pub fn ssim(pair: &PixelPair<'_>) -> Result<f64, Error> {
     let n_rows = pair.size_px[1] as usize - WINDOW + 1;
     let signal = SumAndDifference::of(pair);
     let masked = masked_counts(pair);
-    // Sums are computed per row and added in order, so that the result does not depend on the threads.
+    // Rows are summed in order, so that the result does not depend on the number of threads.
     let rows: Vec<(f64, usize)> = (0..n_rows)
         .into_par_iter()
         .map_init(|| RowScratch::new(width), |scratch, y| scratch.ssim_of_row(&signal, masked.as_deref(), y))
@@ -35,8 +35,8 @@ pub fn ssim(pair: &PixelPair<'_>) -> Result<f64, Error> {
 
 /// `rendered + truth` and `rendered - truth`, colors interleaved, each picture in 0 to 1.
 ///
-/// SSIM follows from the local variances of these two: their sum is twice the sum of the pictures' variances, their
-/// difference four times the covariance. That takes four blurs instead of five.
+/// SSIM follows from the local variances of these two signals: the sum of the variances is twice the sum of the
+/// pictures' variances, and their difference is four times the covariance. This takes four blurs instead of five.
 struct SumAndDifference {
     row_len: usize,
     sum: Vec<f32>,
@@ -58,7 +58,7 @@ impl SumAndDifference {
     }
 }
 
-/// For each column of each row of windows, how many of its 11 pixels are masked; `None` if no pixel is.
+/// For each column of each row of windows, the number of masked pixels among its 11; `None` if no pixel is masked.
 fn masked_counts(pair: &PixelPair<'_>) -> Option<Vec<u8>> {
     let [width, height] = pair.size_px.map(|side| side as usize);
     if (0..width * height).all(|ix| pair.is_visible(ix)) {

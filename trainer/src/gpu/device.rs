@@ -11,11 +11,11 @@ use std::sync::mpsc::RecvTimeoutError;
 use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
-/// How often the device is checked while a read-back has not arrived.
+/// Interval between checks of the device while waiting for a read-back.
 const CHECK_PERIOD: Duration = Duration::from_millis(100);
-/// Size of the blocks that small buffers share on a software adapter, the smallest that wgpu accepts.
+/// Size of the memory blocks that small buffers share on a software adapter: the smallest size that wgpu accepts.
 const SOFTWARE_BLOCK_BYTES: u64 = 4 << 20;
-/// Maximum total size of read-back buffers kept for reuse: a picture of 1024x1024 with depth takes 8 MiB.
+/// Maximum total size of read-back buffers kept for reuse. A 1024x1024 picture with depth takes 8 MiB.
 const MAX_IDLE_STAGING_BYTES: u64 = 32 << 20;
 /// Maximum number of read-back buffers kept for reuse.
 const MAX_IDLE_STAGING: usize = 8;
@@ -35,7 +35,7 @@ pub struct Gpu {
     next_id: AtomicU64,
     /// Read-back buffers for reuse, the oldest first.
     idle_staging: Mutex<VecDeque<wgpu::Buffer>>,
-    /// Locked for reading while memory is mapped or copied: destroying the device unmaps it.
+    /// Read-locked while memory is mapped or copied, because destroying the device unmaps it.
     mapped: RwLock<()>,
 }
 
@@ -64,7 +64,7 @@ impl LiveBuffers {
     }
 }
 
-/// Errors that the device reports outside of any call. They are permanent: only another device can continue.
+/// Errors that the device reports outside of any call. They are permanent: only a new device can continue.
 #[derive(Debug, Default)]
 struct Health {
     /// Why the device was lost.
@@ -90,7 +90,7 @@ impl Health {
         self.failed.get_or_init(|| failure);
     }
 
-    /// Registers callbacks on a device.
+    /// Registers callbacks that record the errors of a device.
     fn of(device: &wgpu::Device) -> Arc<Self> {
         let health = Arc::<Self>::default();
         let (on_loss, on_error) = (health.clone(), health.clone());
@@ -98,7 +98,7 @@ impl Health {
             log::debug!("the device was lost ({reason:?}): {message}");
             on_loss.lost.get_or_init(|| message);
         });
-        // Without a handler wgpu panics.
+        // Without a handler, wgpu panics.
         device.on_uncaptured_error(Arc::new(move |error| on_error.record_error(error)));
         health
     }
@@ -121,12 +121,12 @@ fn all_adapters(instance: &wgpu::Instance) -> Vec<wgpu::Adapter> {
     pollster::block_on(instance.enumerate_adapters(BACKENDS))
 }
 
-/// How the allocator divides the driver's memory among buffers.
+/// Allocation strategy for buffers.
 ///
-/// By default, it places buffers in shared blocks of 128 MiB or more. Buffers that grow with the scene leave holes in these
-/// blocks, and a block returns to the system only when it is empty: in a long run, the blocks took more than twice the bytes in
-/// use. On a software adapter, blocks are host memory. There, each large buffer gets its own block, which costs no more than a
-/// `malloc`. The driver of a real GPU is far slower at allocating blocks and limits their number.
+/// By default, wgpu places buffers in shared blocks of 128 MiB or more. Buffers that grow with the scene leave holes in
+/// these blocks, and a block is freed only when it is empty. In long runs, blocks took more than twice the memory in
+/// use. On a software adapter, blocks are host memory, so each large buffer gets its own block at the cost of a
+/// `malloc`. Drivers of real GPUs allocate blocks far more slowly and limit their number, so there we keep the default.
 fn memory_hints(device_type: wgpu::DeviceType) -> wgpu::MemoryHints {
     match device_type {
         wgpu::DeviceType::Cpu => wgpu::MemoryHints::Manual {
@@ -248,13 +248,13 @@ impl Gpu {
         self.peak_bytes.load(Ordering::Relaxed)
     }
 
-    /// Bytes that the allocator holds for buffers, used or not; `None` if the backend does not report it. Slow: it lists every
-    /// allocation.
+    /// Bytes that the allocator reserves for buffers, including unused memory; `None` if the backend does not report
+    /// them. Slow, because it lists every allocation.
     pub fn reserved_bytes(&self) -> Option<u64> {
         Some(self.device.generate_allocator_report()?.total_reserved_bytes)
     }
 
-    /// Whether the device was lost. Nothing that was created on it can be used anymore.
+    /// Whether the device was lost. If so, nothing that was created on it can be used.
     pub fn is_lost(&self) -> bool {
         self.health.lost.get().is_some()
     }
@@ -271,13 +271,13 @@ impl Gpu {
 
     /// Loses the device on purpose, like a driver reset; for tests of recovery.
     pub fn lose(&self) {
-        // `destroy` frees memory at once, unlike a device that fails: nobody may read it, and no copy may be under way.
+        // Unlike a driver reset, `destroy` frees memory at once, so wait for readers and copies first.
         let _no_reader = self.mapped.write();
         let _ = self.device.poll(wgpu::PollType::Wait { submission_index: None, timeout: None });
         self.device.destroy();
     }
 
-    /// A zeroed storage buffer; an error if the adapter cannot bind it or has no memory for it.
+    /// Creates a zeroed storage buffer. Fails if the adapter cannot bind it or has no memory for it.
     pub fn storage(&self, label: &str, bytes: u64) -> Result<Buffer, Error> {
         let bytes = bytes.max(16).next_multiple_of(16);
         if bytes > self.max_binding_bytes() {
@@ -297,14 +297,14 @@ impl Gpu {
         pollster::block_on(memory.pop()).map_or(Ok(buffer), |_| Err(full()))
     }
 
-    /// A storage buffer holding `contents`.
+    /// Creates a storage buffer that holds `contents`.
     pub fn storage_with(&self, label: &str, contents: &[u8]) -> Result<Buffer, Error> {
         let buffer = self.storage(label, contents.len() as u64)?;
         self.write(&buffer, 0, contents);
         Ok(buffer)
     }
 
-    /// A uniform buffer holding `contents`.
+    /// Creates a uniform buffer that holds `contents`.
     pub fn uniform_with<T: bytemuck::Pod>(&self, label: &str, contents: &T) -> Buffer {
         let bytes = bytemuck::bytes_of(contents);
         let buffer = self.buffer(label, bytes.len() as u64, wgpu::BufferUsages::UNIFORM | wgpu::BufferUsages::COPY_DST);
@@ -312,14 +312,14 @@ impl Gpu {
         buffer
     }
 
-    /// A buffer that one kernel writes and others read as a uniform.
+    /// Creates a buffer that one kernel writes and others read as a uniform.
     pub fn uniform_and_storage(&self, label: &str, bytes: u64) -> Buffer {
         let copied = wgpu::BufferUsages::COPY_SRC | wgpu::BufferUsages::COPY_DST;
         let usage = wgpu::BufferUsages::UNIFORM | wgpu::BufferUsages::STORAGE | copied;
         self.buffer(label, bytes, usage)
     }
 
-    /// Writes before the next submit; a length that is not a multiple of 4 is padded with zeros.
+    /// Writes to a buffer before the next submit. Pads `contents` with zeros to a multiple of 4 bytes.
     pub fn write(&self, buffer: &Buffer, offset_bytes: u64, contents: &[u8]) {
         let whole = contents.len() / 4 * 4;
         self.queue.write_buffer(&buffer.raw, offset_bytes, &contents[..whole]);
@@ -352,7 +352,7 @@ impl Gpu {
         self.submit_reading(self.encoder(), &[(buffer, n * size_of::<T>())]).finish(self)
     }
 
-    /// Begins to read the first `n` words of `buffer`, with the contents after everything submitted so far.
+    /// Begins to read the first `n` words of `buffer`, as they will be after all work submitted so far.
     pub fn begin_read(&self, buffer: &Buffer, n: usize) -> PendingRead {
         self.submit_reading(self.encoder(), &[(buffer, 4 * n)])
     }
@@ -361,8 +361,8 @@ impl Gpu {
         self.device.create_command_encoder(&wgpu::CommandEncoderDescriptor::default())
     }
 
-    /// Submits the encoded commands, followed by a copy of the first bytes of each of these buffers. All of them share one
-    /// read-back, which is one wait and one mapping.
+    /// Submits the encoded commands, followed by a copy of the first bytes of each of these buffers. All copies share
+    /// one read-back, so there is one wait and one mapping.
     pub(super) fn submit_reading(&self, mut encoder: wgpu::CommandEncoder, reads: &[(&Buffer, usize)]) -> PendingRead {
         let padded = |n_bytes: usize| n_bytes.next_multiple_of(4);
         let n_all_bytes = reads.iter().map(|(_, n_bytes)| padded(*n_bytes) as u64).sum();
@@ -386,7 +386,7 @@ impl Gpu {
         PendingRead(Ok(Reading { staging, submission, mapped, parts }))
     }
 
-    /// A read-back buffer, reused if one fits; `None` if no memory is left for it.
+    /// Returns a read-back buffer, reused if one fits; `None` if no memory is left.
     fn staging(&self, bytes: u64) -> Option<wgpu::Buffer> {
         let bytes = bytes.max(4);
         let mut idle = self.idle_staging.lock();
@@ -429,7 +429,7 @@ impl Gpu {
     }
 
     fn poll(&self, until: wgpu::PollType) -> Result<(), Error> {
-        // wgpu panics if it notices a lost device while it waits.
+        // wgpu panics if the device is lost during the wait.
         let _mapping = self.mapped.read(); // Polling maps buffers.
         let polled = std::panic::catch_unwind(AssertUnwindSafe(|| self.device.poll(until)));
         match polled {
@@ -440,7 +440,7 @@ impl Gpu {
         }
     }
 
-    /// The reason for a failure that only a lost device causes.
+    /// The recorded failure, or [`Error::DeviceLost`] if there is none.
     fn failure(&self) -> Error {
         self.check().err().unwrap_or(Error::DeviceLost)
     }
@@ -462,7 +462,7 @@ impl Gpu {
     }
 }
 
-/// A read-back in progress; the error is the size in bytes of a staging buffer for which there was no memory.
+/// A read-back in progress, or the size in bytes of the staging buffer that could not be allocated.
 #[derive(Debug)]
 pub struct PendingRead(Result<Reading, u64>);
 
@@ -487,7 +487,7 @@ impl PendingRead {
         let Reading { staging, submission, mapped, parts } = reading;
         gpu.poll(wgpu::PollType::Wait { submission_index: Some(submission), timeout: None })?;
         let is_mapped = loop {
-            // Another waiting thread may run the callback, and a lost device may never do so.
+            // The callback may run on another waiting thread, and may never run if the device is lost.
             match mapped.recv_timeout(CHECK_PERIOD) {
                 Ok(result) => break result.is_ok(),
                 Err(RecvTimeoutError::Timeout) => gpu.check()?,
@@ -498,7 +498,7 @@ impl PendingRead {
             return Err(gpu.failure());
         }
         let reading = gpu.mapped.read();
-        gpu.check()?; // Before the mapped memory is touched: a destroyed device has unmapped it.
+        gpu.check()?; // Before mapped memory is accessed, because destroying the device unmaps it.
         let view = staging.get_mapped_range(..).map_err(|_| gpu.failure())?;
         let read: Vec<&[u8]> = parts.iter().map(|part| &view[part.clone()]).collect();
         let taken = take(&read);

@@ -7,9 +7,9 @@ pub struct GpuOptions {
     pub optional_features: bool,
     /// Whether cooperative matrices may be used.
     pub matrices: bool,
-    /// Lowers the largest binding, bytes; for tests of buffer limits.
+    /// Lowers the maximum size of a binding, bytes; for tests of buffer limits.
     pub max_binding_bytes: Option<u64>,
-    /// Total size of all storage buffers above which the GPU counts as full, bytes; for tests of running out of memory.
+    /// Maximum total size of all storage buffers, bytes; for tests of running out of memory.
     pub memory_limit_bytes: Option<u64>,
     /// Index into [`Gpu::adapters`](super::Gpu::adapters); `None`: the fastest adapter.
     pub adapter: Option<usize>,

@@ -23,7 +23,7 @@ enum Pass {
     Copy { from: (wgpu::Buffer, u64), to: (wgpu::Buffer, u64), bytes: u64 },
 }
 
-/// A list of GPU passes; adding to it does not touch the GPU.
+/// A list of GPU passes. Adding a pass does not touch the GPU.
 ///
 /// Bind groups are cached across submits, keyed by kernel and buffers; [`Passes::clear_bindings`] drops them.
 #[derive(Default)]
@@ -45,10 +45,10 @@ impl std::fmt::Debug for Passes {
 }
 
 impl Passes {
-    /// Adds a kernel over `n_groups` workgroups, folded to two axes; buffers are bound by their names in the WGSL.
+    /// Adds a dispatch of `n_groups` workgroups, folded onto two axes. Buffers are bound by their names in the WGSL.
     ///
     /// # Panics
-    /// If the names differ from those of the kernel, which is a bug in this crate. The message lists both.
+    /// Panics if the names differ from those in the kernel, which is a bug in this crate. The message lists both.
     pub fn dispatch(&mut self, gpu: &Gpu, pipeline: &Pipeline, n_groups: u64, buffers: &[(&str, &Buffer)]) {
         if n_groups == 0 {
             return;
@@ -61,7 +61,7 @@ impl Passes {
         let Some(found) = found.filter(|found| found.len() == buffers.len()) else {
             let reads: Vec<_> = pipeline.bindings.iter().map(|binding| binding.name.as_str()).collect();
             let given: Vec<_> = buffers.iter().map(|(name, _)| *name).collect();
-            panic!("kernel {} binds {reads:?}, given {given:?}", pipeline.name);
+            panic!("kernel {} binds {reads:?}, got {given:?}", pipeline.name);
         };
         let key = (pipeline.id, found.iter().map(|buffer| buffer.id).collect());
         let bind_group = self.bind_groups.entry(key).or_insert_with(|| {
@@ -93,12 +93,12 @@ impl Passes {
         self.clear_range(buffer, 0..buffer.bytes());
     }
 
-    /// Adds a pass that fills part of a buffer with zeros; begin and end are multiples of 4.
+    /// Adds a pass that fills part of a buffer with zeros. Start and end must be multiples of 4.
     pub fn clear_range(&mut self, buffer: &Buffer, bytes: Range<u64>) {
         self.list.push(Pass::Clear { buffer: buffer.raw.clone(), bytes });
     }
 
-    /// Adds a copy of bytes from one buffer to another; offsets and length are multiples of 4.
+    /// Adds a copy of bytes from one buffer to another. Offsets and length must be multiples of 4.
     pub fn copy(&mut self, from: (&Buffer, u64), to: (&Buffer, u64), bytes: u64) {
         if bytes > 0 {
             self.list.push(Pass::Copy { from: (from.0.raw.clone(), from.1), to: (to.0.raw.clone(), to.1), bytes });
@@ -115,7 +115,7 @@ impl Passes {
         self.list.is_empty()
     }
 
-    /// Drops the cached bind groups, and with them buffers that have no other owner.
+    /// Drops the cached bind groups, which also frees buffers that have no other owner.
     pub fn clear_bindings(&mut self) {
         self.bind_groups.clear();
     }
@@ -127,15 +127,15 @@ impl Passes {
         gpu.queue.submit([encoder.finish()]);
     }
 
-    /// Submits the list, empties it, and begins to read the first bytes of each of these buffers, with their contents
-    /// after the list: one submit and one read-back for all.
+    /// Submits the list, empties it, and begins to read the first bytes of each of these buffers, as they will be after
+    /// the list. All buffers share one submit and one read-back.
     pub fn submit_reading(&mut self, gpu: &Gpu, reads: &[(&Buffer, usize)]) -> PendingRead {
         let mut encoder = gpu.encoder();
         encode_all(&mut encoder, self.list.drain(..));
         gpu.submit_reading(encoder, reads)
     }
 
-    /// Submits the list, waits, and returns the GPU time from the beginning of the first pass to the end of the last,
+    /// Submits the list, waits, and returns the GPU time from the start of the first pass to the end of the last pass,
     /// milliseconds.
     ///
     /// Returns `None` if the adapter has no timestamps.

@@ -5,13 +5,13 @@ use super::GpuOptions;
 /// Optional features of the adapter; each has a fallback.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Optional {
-    /// Smallest number of lanes per subgroup, if subgroup operations may be used: 4 to 128.
+    /// Smallest number of lanes per subgroup, 4 to 128; `None` if subgroup operations may not be used.
     ///
-    /// Without it, sorting ranks sequentially, and the backward pass sums over lanes through workgroup memory.
+    /// Without subgroups, sorting ranks keys sequentially, and the backward pass sums over lanes in workgroup memory.
     pub subgroup_lanes: Option<u32>,
     /// GPU timestamps for the time of each pass; without them, only wall time is available.
     pub timestamps: bool,
-    /// Products of 16x16 f16 matrices, summed in f32, each computed by a subgroup; without them, neural fields use f32.
+    /// Subgroup products of 16x16 f16 matrices, summed in f32. Without them, neural fields use f32.
     pub half_matrices: bool,
 }
 

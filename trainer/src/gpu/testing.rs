@@ -1,4 +1,4 @@
-//! Checks of the kernels of a model: they are valid, and their structs have the same layout in Rust and WGSL.
+//! Test helpers that check that kernels are valid, and that their structs have the same layout in Rust and WGSL.
 
 use super::{Kernel, reflect, resolve};
 

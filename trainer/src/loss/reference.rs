@@ -1,9 +1,9 @@
 //! Plain CPU version of the training loss in f64: absolute difference, structural similarity (SSIM) and depth, with
 //! gradients.
 //!
-//! Source: Kerbl et al. 2023, equation 7; SSIM of Wang et al. 2004 with a Gaussian window. We divide by the number of
-//! all pixels, masked or not, and do not divide our depth residual by the coverage, so that it stays linear in the
-//! image.
+//! Source: Kerbl et al. 2023, equation 7; SSIM of Wang et al. 2004 with a Gaussian window. We divide by the total
+//! number of pixels, including masked ones. We do not divide the depth residual by the coverage, so that it is linear
+//! in the image.
 
 use super::rendered_image::{RenderedImage, Upstream};
 
@@ -79,14 +79,14 @@ pub fn loss(image: &RenderedImage, target: &Target, weights: &Weights) -> (Loss,
     (loss, upstream)
 }
 
-/// Mean absolute difference and its gradient with respect to `rendered`, which is 0 where the two are equal.
+/// Mean absolute difference and its gradient with respect to `rendered`. The gradient is 0 where the values are equal.
 fn mean_abs(rendered: &[f64], truth: &[f64]) -> (f64, Vec<f64>) {
     let n_pixels = rendered.len() as f64;
     let residuals = rendered.iter().zip(truth).map(|(rendered, truth)| rendered - truth);
     (residuals.clone().map(f64::abs).sum::<f64>() / n_pixels, residuals.map(|r| sign(r) / n_pixels).collect())
 }
 
-/// Mean SSIM over all pixels of one channel and its gradient with respect to `rendered`; both images are 0 outside
+/// Mean SSIM over all pixels of one channel and its gradient with respect to `rendered`. Both images are 0 outside
 /// their borders.
 pub fn mean_ssim(size_px: [usize; 2], rendered: &[f64], truth: &[f64]) -> (f64, Vec<f64>) {
     let n_pixels = rendered.len() as f64;
@@ -124,7 +124,7 @@ fn depth(image: &RenderedImage, target: &Target, weights: &Weights, upstream: &m
     let n_pixels = target.rgb.len() as f64;
     let mut sum = 0.0;
     for (pixel_ix, &depth_m) in target.depth_m.iter().enumerate().filter(|(_, depth_m)| **depth_m > 0.0) {
-        // Compares the rendered depth with the true depth, both weighted by the coverage.
+        // Compares the rendered depth with the true depth; both are weighted by the coverage.
         let residual_m = image.depth[pixel_ix] - (1.0 - image.transmittance[pixel_ix]) * depth_m;
         sum += residual_m.abs().min(weights.depth_clip_m);
         if residual_m.abs() < weights.depth_clip_m {
@@ -213,10 +213,10 @@ mod tests {
         (image, target)
     }
 
-    /// Compares the gradient, times `factor`, with central differences; skips numbers without influence.
+    /// Compares the gradient, times `factor`, with central differences. Skips values that do not affect the loss.
     fn checked_gradient(factor: f64) -> Mismatches {
         const NUDGE: f64 = 1e-5;
-        const ABS: f64 = 1e-10; // Rounding of a loss of about 1, divided by the nudge.
+        const ABS: f64 = 1e-10; // Rounding error of a loss near 1, divided by the nudge.
         const REL: f64 = 1e-6;
         let (image, target) = image_and_target();
         let (_, upstream) = loss(&image, &target, &WEIGHTS);
@@ -304,8 +304,8 @@ mod tests {
 
     #[test]
     fn flat_image_gives_known_values() {
-        // A fully opaque render that is 0.25 too bright everywhere. The depth of one pixel is off by 0.1 m, that of
-        // another beyond the clip threshold.
+        // A fully opaque render that is 0.25 too bright everywhere. The depth of one pixel is off by 0.1 m, and the
+        // depth of another by more than the clip threshold.
         let n = N_PIXELS;
         let mut depth_m = vec![0.0; n];
         (depth_m[3], depth_m[4]) = (2.0, 2.0);

@@ -1,4 +1,4 @@
-// ssim_strips: `ssim` for adapters whose lanes access memory one after another.
+// ssim_strips: variant of `ssim` for adapters whose lanes access memory one after another.
 //
 // threads   8 per color and two vertically adjacent tiles of 16 x 16 pixels (see `rows_and_columns`)
 // reads     same as `ssim`

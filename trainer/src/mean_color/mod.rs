@@ -1,6 +1,6 @@
-//! A method for tests: its model is one color, which moves to the mean color of the keyframes.
+//! A method for tests. Its model is one color, which moves toward the mean color of the keyframes.
 //!
-//! It is registered like every other method and needs no kernels, so it also shows what a method consists of.
+//! It is registered like any other method but needs no kernels, so it also serves as a minimal example of a method.
 
 use crate::checkpoint::{Checkpoint, PendingCheckpoint};
 use crate::gpu::{Gpu, PassTiming};
@@ -17,7 +17,7 @@ use serde::{Deserialize, Serialize};
 use std::path::Path;
 use std::sync::Arc;
 
-/// The color as a method.
+/// Registry entry of the method.
 pub(crate) static ENTRY: MethodEntry = MethodEntry {
     name: MeanColorOptions::METHOD,
     description: "one color",
@@ -36,14 +36,14 @@ pub(crate) static ENTRY: MethodEntry = MethodEntry {
     load: |_, folder| Ok(Box::new(Aligned::load(MeanColor::load(folder)?, folder)?)),
 };
 
-/// The saved color: a checkpoint.
+/// File of the saved color, in the format of a checkpoint.
 const COLOR_FILE: &str = "mean.color";
 
 /// Options of a [`MeanColor`].
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct MeanColorOptions {
-    /// Fraction of the distance to the color of a keyframe that the color moves in a step.
+    /// Fraction of the difference from a keyframe's color that one step removes.
     pub(crate) rate: f64,
 }
 
@@ -81,7 +81,7 @@ impl MeanColor {
         Self { options, keyframes: Vec::new(), color_srgb: [0.0; 3], step: 0 }
     }
 
-    /// Resumes from a checkpoint; returns the keyframes that the model was not trained on, too.
+    /// Resumes from a checkpoint. Also returns the keyframes that the model was not trained on.
     pub(crate) fn resume(
         checkpoint: &Checkpoint,
         keyframes: &[Arc<Keyframe>],

@@ -16,7 +16,7 @@ use crate::gpu::{Buffer, Gpu, GpuOptions, Passes, f32_of, f32s_of};
 use crate::mismatches::Mismatches;
 use crate::optim::reference::{Adam, Moments};
 
-/// More samples than one partial sum covers.
+/// Enough rays for more samples than one partial sum covers.
 const N_RAYS: u32 = 90;
 
 /// Rows of a matrix, padded with zeros.
@@ -174,14 +174,14 @@ fn bench(options: &GpuOptions, twin: &Field, rays: &[Ray], scales: &[f32]) -> Be
     }
 }
 
-/// All features of the adapter; without cooperative matrices; without any optional feature.
+/// All optional features; all except cooperative matrices; none.
 fn gpu_variants() -> [GpuOptions; 3] {
     let all = GpuOptions::default();
     [all, GpuOptions { matrices: false, ..all }, GpuOptions { optional_features: false, ..all }]
 }
 
-/// Factor on gradient tolerances if layers are cooperative matrices: gradients are then f16, with 11 bits, although
-/// summed in f32.
+/// Factor on gradient tolerances. With cooperative matrices, gradients are f16 numbers with 11 bits, although sums are
+/// f32.
 fn tolerance_scale_of(widths: &Widths) -> f64 {
     if widths.is_half_precision { 200.0 } else { 1.0 }
 }
@@ -220,7 +220,7 @@ fn colors_and_gradients_match_twin() {
         list.submit(gpu);
 
         let tolerance_scale = tolerance_scale_of(widths);
-        // Forward values have twice as many bits.
+        // Forward values have twice as many bits as gradients.
         let (abs, rel) = if widths.is_half_precision { (5e-5, 5e-5) } else { (1e-5, 1e-5) };
         let mut mismatches = Mismatches::default();
         let ray_colors: Vec<[f32; 4]> = gpu.read(&step.ray_colors, rays.len()).unwrap();
@@ -253,8 +253,8 @@ fn colors_and_gradients_match_twin() {
     }
 }
 
-/// Gradients with respect to poses and appearance embeddings of images, and the first step of each. Images have seven
-/// rays, the last one fewer.
+/// Gradients with respect to poses and appearance embeddings of images, and the first step of each parameter. Images
+/// have seven rays, the last one has fewer.
 #[test]
 fn image_param_gradients_match_twin() {
     const RAYS_PER_IMAGE: usize = 7;
@@ -288,7 +288,7 @@ fn image_param_gradients_match_twin() {
             unused: 0.0,
         };
         let moments = FieldMoments::new(gpu, &twin.shape, widths, &rule).unwrap();
-        let n_images = u32::try_from(N_IMAGES + 1).unwrap(); // One has no rays.
+        let n_images = u32::try_from(N_IMAGES + 1).unwrap(); // One image has no rays.
         let [rotation_rate, translation_rate, embedding_rate] = RATES.map(f32_of);
         let rule = ImageParamRule {
             learned,
@@ -356,7 +356,7 @@ fn image_param_gradients_match_twin() {
                     2e-4 * tolerance_scale,
                 );
                 mismatches.check(label("square"), second / 0.01, (first / 0.1).powi(2), 1e-12, 1e-4);
-                // The first step has the length of the rate; weight decay then takes back half of it.
+                // The first step has the length of the rate; weight decay then undoes half of it.
                 mismatches.check(label("value"), value, -0.5 * RATES[part] * first.signum(), 1e-6, 1e-5);
                 mismatches.check(label("steps"), n_steps, 1.0, 1e-9, 0.0);
             }
@@ -401,14 +401,14 @@ fn optimizer_steps_match_twin() {
         rate: 0.02,
         final_rate_frac: 0.25,
         betas: [0.75, 0.875],
-        epsilon: 1e-4, // Small gradients, which f32 represents less precisely, move less.
+        epsilon: 1e-4, // Shortens the steps of small gradients, which are less precise in f32.
         weight_decay: 0.0,
         n_planned_steps: 4.0,
         unused: 0.0,
     };
     let of_weights = AdamRule { rate: 0.01, weight_decay: 0.5, ..grid_rule };
-    let first_scale = 2f32.powi(28); // Fine enough for the first step; later steps choose their own.
-    // A step along f16 noise would be as long as a real one.
+    let first_scale = 2f32.powi(28); // Fine enough for the first step; the kernels then adapt the scales.
+    // Uses f32 layers, because a step along f16 noise would be as long as a real step.
     let options = GpuOptions { matrices: false, ..GpuOptions::default() };
     let bench = bench(&options, &twin, &rays, &vec![first_scale; twin.shape.n_cells.len()]);
     let Bench { gpu, pipelines, widths, field: buffers, samples, step: kept_step, gradients, slot, image_params } =
@@ -469,8 +469,8 @@ fn optimizer_steps_match_twin() {
     assert!(scales.iter().any(|scale| *scale != first_scale), "{scales:?}");
 }
 
-/// The first step of the weights, along the summed gradients. The twin's gradients are not used: they differ too much
-/// from f16 ones to predict the sign of a small gradient.
+/// Checks the first step of the weights against the summed gradients of the kernels. The twin's gradients differ too
+/// much from f16 gradients to predict the sign of a small gradient.
 #[test]
 fn first_step_follows_summed_gradients() {
     let (twin, rays) = (field(7), rays());

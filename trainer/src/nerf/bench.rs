@@ -1,7 +1,7 @@
 //! Times a training step on synthetic rays, pass by pass.
 //!
-//! Rays begin anywhere in a fully occupied cube and have equal lengths, so that a step has a known number of samples;
-//! their colors are noise. The occupancy is not updated.
+//! Rays start at random positions in a fully occupied cube and have equal lengths, so that a step has a known number of
+//! samples. Their colors are noise. The occupancy is not updated.
 
 use super::field_trainer::{Compiled, FieldTrainer, STEPS_PER_SUBMIT};
 use super::options::NerfBudget;
@@ -20,7 +20,7 @@ use std::time::Instant;
 /// Number of levels, coarsest and finest cells along an axis, and log2 of the entries per level, as in Mueller et al.
 /// 2022.
 const GRID_SHAPE: (u32, u32, u32, u32) = (16, 16, 2048, 19);
-/// Not a multiple of the steps between two occupancy updates.
+/// Step at which no occupancy update is due.
 const STEP: u64 = 1;
 
 /// Timings for one number of samples.
@@ -30,12 +30,12 @@ pub struct StepFigures {
     pub n_rays: u32,
     /// Samples per step.
     pub n_samples: u32,
-    /// GPU time of a step, milliseconds: median of the sum over its passes, or wall time without timestamps.
+    /// GPU time of a step, milliseconds: median of the sum over its passes; wall time if there are no timestamps.
     pub step_millis: f64,
     /// Wall time of a step, milliseconds: mean of consecutive steps.
     pub step_wall_millis: f64,
-    /// GPU time to render the colors of as many samples of a picture, milliseconds: median, or wall time without
-    /// timestamps.
+    /// GPU time to render the colors of `n_samples` samples of a picture, milliseconds: median; wall time if there are
+    /// no timestamps.
     pub colors_millis: f64,
     /// GPU time of each pass of one step; empty without timestamps.
     pub passes: Vec<PassTiming>,
@@ -64,7 +64,7 @@ pub fn time_steps(gpu: &Gpu, n_rays: u32, n_samples: u32, n_repeats: usize) -> R
     let since = Instant::now();
     let mut before = None;
     for _ in 0..n_submits {
-        // As in training, encode the next submit while one runs.
+        // As in training, encode the next submit while the previous one runs.
         if let Some(before) = before.replace(submit(&mut field_trainer, STEPS_PER_SUBMIT)?) {
             before.finish::<u32>(gpu)?;
         }
@@ -105,7 +105,7 @@ pub fn time_steps(gpu: &Gpu, n_rays: u32, n_samples: u32, n_repeats: usize) -> R
     })
 }
 
-/// Rays with equal numbers of samples that fill the batch.
+/// Rays with equal numbers of samples, which together fill the batch.
 fn synthetic_rays(nerf_budget: NerfBudget) -> Vec<Ray> {
     let NerfBudget { n_rays, n_samples, n_steps, .. } = nerf_budget;
     // Half a step shorter, so that rounding does not change the count.
@@ -114,7 +114,7 @@ fn synthetic_rays(nerf_budget: NerfBudget) -> Vec<Ray> {
         let number = |stream: u64| 2.0 * unit_from_bits(hash(u64::from(ix) << 8 | stream)) - 1.0;
         let triple = |stream: u64| Vector3::from_fn(|axis, _| number(stream + axis as u64));
         let direction = triple(0).normalize();
-        // Clamped so that the ray's center is in the cube and all of it is where steps have constant length.
+        // Clamped so that the whole ray is in the region where steps have constant length.
         let origin = (triple(3) * 0.5).map(|along| along.clamp(-0.5, 0.5)) - 0.5 * length * direction;
         let target = hash(u64::from(ix) << 8 | 6).to_le_bytes();
         Ray {

@@ -17,11 +17,11 @@ pub(crate) struct FieldBuffers {
     pub(crate) grid: Buffer,
     /// Weights of all layers of both networks, `[outputs, inputs]` each.
     pub(crate) weights: Buffer,
-    /// The weights before the step as two f16 numbers each; only if layers use cooperative matrices.
+    /// The weights before the step, as two f16 numbers each; only if layers use cooperative matrices.
     pub(crate) half_weights: Option<Buffer>,
     /// Placeholder for bindings that a kernel does not use.
     pub(crate) unused_buffer: Buffer,
-    /// Placeholder for image parameters, with no images.
+    /// Placeholder for the parameters of images if there are none.
     pub(crate) no_image_params: Buffer,
     pub(crate) n_entries: u32,
 }
@@ -72,7 +72,7 @@ pub(crate) fn n_blocks(n_cells: u32) -> u32 {
 }
 
 impl Occupancy {
-    /// An occupancy grid with all cells marked. With depth, the cells start as outside all views until hints arrive.
+    /// An occupancy grid with all cells marked. With depth, cells count as outside all views until hints arrive.
     pub(crate) fn new(gpu: &Gpu, occupancy_update: &OccupancyUpdate, has_depth: bool) -> Result<Self, Error> {
         let n = occupancy_update.n_cells.pow(3) as usize;
         let n_words = n / 32 + n_blocks(occupancy_update.n_cells).pow(3).div_ceil(32) as usize;
@@ -98,7 +98,7 @@ pub(crate) const THREADS_PER_RAY: u32 = 8;
 pub(crate) struct RaySlot {
     pub(crate) n_rays: u32,
     pub(crate) rays: Buffer,
-    /// Number of segments found per ray; and, per thread of a ray, the number found by the threads before it.
+    /// Number of segments found per ray; and, per thread of a ray, the number found by earlier threads.
     pub(crate) n_found: Buffer,
     pub(crate) n_before: Buffer,
     pub(crate) march: Buffer,
@@ -136,7 +136,7 @@ pub(crate) struct SampleBuffers {
 /// Intermediate values of a training step for its samples and rays.
 #[derive(Debug)]
 pub(crate) struct StepBuffers {
-    /// Inputs of each layer, as numbers of [`Widths::bytes_per_number`] bytes; so is the next field.
+    /// Inputs of each layer. The numbers in this buffer and the next have [`Widths::bytes_per_number`] bytes each.
     pub(crate) activations: Buffer,
     /// Gradients with respect to the outputs of each layer.
     pub(crate) v_activations: Buffer,
@@ -155,7 +155,7 @@ pub(crate) struct ImageParamBuffers {
     pub(crate) image_params: Buffer,
     pub(crate) rule: Buffer,
     pub(crate) n_images: u32,
-    /// Gradients with respect to the position of each sample, and to each ray.
+    /// Gradients with respect to the position of each sample, and with respect to the pose of each ray.
     pub(crate) v_points: Buffer,
     pub(crate) v_rays: Buffer,
     /// Gradients with respect to the appearance embedding, per sample.

@@ -12,18 +12,18 @@ use rayon::prelude::*;
 const UNBOUNDED: u32 = 0;
 const FREE: u32 = 1 << 30;
 const SURFACE: u32 = 2 << 30;
-/// Distance up to which rays without a reading are followed, in units of the scene radius.
+/// Maximum distance up to which cells along rays without a reading are marked, in units of the scene radius.
 const UNBOUNDED_DISTANCE: f64 = 50.0;
-/// Depth readings per ray that is marked as free space. Readings, and pixels without one, are processed every half
-/// cell; free space in front of readings needs fewer rays.
+/// Depth readings per ray whose free space is marked. Surfaces and missing readings are processed at a spacing of half
+/// a cell; free space needs fewer rays.
 const READINGS_PER_FREE_RAY: u32 = 4;
-/// Radius in pixels within which a hole in the depth image is distinguished from a region that the depth camera cannot
-/// measure.
+/// Radius, in pixels, of the neighborhood that distinguishes a small hole in the depth image from a region that the
+/// depth camera cannot measure.
 const HOLE_RADIUS_PX: u32 = 2;
-/// Relative error of a reading. Cells within this distance in front of it are not marked as free.
+/// Relative error of a reading. Cells closer than this in front of a reading are not marked as free.
 const DEPTH_ERROR_FRAC: f64 = 0.03;
 
-/// Cells that images observe: without a limit, as free space, or as a surface.
+/// Cells that images observe: along rays without a reading, as free space, or as a surface.
 #[derive(Debug)]
 struct Cells {
     unbounded: CellSet,
@@ -63,7 +63,7 @@ impl CellSet {
 /// Origin and direction of a ray, in units of the scene radius.
 type UnitRay = ([f64; 3], [f64; 3]);
 
-/// Pixels between the rays that are followed: half a cell at a distance of one radius.
+/// Spacing of the rays in pixels: half a cell at a distance of one radius.
 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped")]
 fn stride_of(focal_px: [f64; 2], march: &March) -> u32 {
     (2.0 / march.n_cells as f64 * focal_px[0]).clamp(1.0, 16.0) as u32
@@ -83,8 +83,8 @@ fn is_reading(z_m: f64) -> bool {
     z_m.is_finite() && z_m > 0.0
 }
 
-/// Whether most pixels around one without a reading have one. Such a hole is not evidence of a far or unmeasurable
-/// region.
+/// Whether most pixels around a pixel without a reading have one. Such a small hole is not evidence of a far or
+/// unmeasurable region.
 fn is_small_hole(depth: &DepthMap, [x, y]: [u32; 2]) -> bool {
     let [width, height] = depth.size_px;
     let around = |coordinate: u32, size: u32| {
@@ -96,12 +96,12 @@ fn is_small_hole(depth: &DepthMap, [x, y]: [u32; 2]) -> bool {
     2 * n_read > n
 }
 
-/// Width of the cell around a point, in world, where contracted cells are larger.
+/// World width of the cell around a point. Cells in the contracted region are wider.
 fn cell_width(march: &March, point: [f64; 3]) -> f64 {
     4.0 / march.n_cells as f64 * largest(point).1.max(1.0).powi(2)
 }
 
-/// Hints from images about cells, one per cell. Cells that no image observes get none.
+/// Derives occupancy hints from images, at most one per cell. Cells that no image observes get none.
 pub(crate) fn hints(keyframes: &[&Keyframe], extent: &Extent, march: &March) -> Vec<u32> {
     let empty = || Cells::new(march.n_cells.pow(3));
     let Cells { unbounded, free, surfaces } = keyframes
@@ -160,7 +160,7 @@ impl Cells {
         }
     }
 
-    /// Adds rays of a color image outside the field of view of its depth image, followed without a limit.
+    /// Adds the rays of a color image that are outside the field of view of its depth image, as rays without a reading.
     fn add_color_only_rays(&mut self, keyframe: &Keyframe, extent: &Extent, march: &March) {
         let Keyframe { size_px: [width, height], focal_px, principal_px, world_from_camera, depth, .. } = keyframe;
         let depth = depth.as_ref().map(|depth| (depth, depth.world_from_camera.inverse() * world_from_camera));
@@ -195,7 +195,7 @@ impl Cells {
         }
     }
 
-    /// Marks the cells at a reading, up to one cell width in front of it and behind it.
+    /// Marks the cells around a reading, up to one cell width in front of it and behind it.
     fn mark_surface(&mut self, march: &March, (origin, direction): UnitRay, distance: f64) {
         let point = |t: f64| std::array::from_fn(|axis| origin[axis] + t * direction[axis]);
         let width = cell_width(march, point(distance));

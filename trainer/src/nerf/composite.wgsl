@@ -5,10 +5,10 @@
 // writes    ray_colors [n_rays] (rgb without background, transmittance), ray_errors [n_rays] (squared color error,
 //           rendered distance), v_log_density [n_samples], v_colors [n_samples]
 // twin      nerf/reference/ray.rs
-// source    Max 1995; line of sight of Rematas et al. 2022, equations 9 to 12, with a band in place of a bell;
+// source    Max 1995; line of sight of Rematas et al. 2022, equations 9 to 12, with a band instead of a bell curve;
 //           distortion of Barron et al. 2022, equation 15, in one pass as in Sun et al. 2022
 //
-// Gradients are of the mean over the rays.
+// Gradients are with respect to the mean loss over the rays.
 
 #import folded
 #import ray_batch
@@ -70,11 +70,11 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
         v_distance = loss.distance_weight * per_ray * sign(distance_residual);
         v_transmittance += v_distance * ray.target_distance;
     }
-    // The part behind a sample is the total minus the sample's own part and the part in front of it.
+    // The part behind a sample is the total minus the part of the sample and the part in front of it.
     var behind = dot(v_rgb, rgb) + v_distance * distance + line_of_sight * (weight_sq_elsewhere - (1.0 - weight_near_reading) * weight_near_reading);
     let distortion_weight = loss.distortion * per_ray;
     var before = vec2f(0.0);
-    // The distortion gradients of the weights are added to it in a separate pass.
+    // A separate pass adds the distortion gradients of the weights to `behind`.
     var transmittance_before = 1.0;
     for (var ix = ray.first_sample; ix < end && distortion_weight > 0.0; ix++) {
         let sample = sample_at(ix);
@@ -101,7 +101,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     }
 }
 
-// Whether a sample is near the depth reading; band: distance of the reading and its tolerance.
+// Whether a sample is near the depth reading. `band`: distance and tolerance of the reading.
 fn is_near_reading(sample: Sample, band: vec2f) -> bool {
     return abs(0.5 * (sample.begin + sample.end) - band.x) <= band.y;
 }

@@ -1,8 +1,8 @@
-// count_samples: number of segments of each ray that are in occupied cells.
+// count_samples: counts the segments of each ray that are in occupied cells.
 //
 // threads   8 per ray, each for a part of it
 // reads     batch, march, rays, occupied (one bit per cell, then one bit per block)
-// writes    n_found [n_rays], n_before [n_rays, 8] (number found by the threads before)
+// writes    n_found [n_rays], n_before [n_rays, 8] (number of segments found by earlier threads of the ray)
 // twin      nerf/reference/march.rs
 
 #import folded

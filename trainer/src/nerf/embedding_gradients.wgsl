@@ -1,5 +1,5 @@
 // embedding_gradients: gradients of every sample with respect to the appearance embedding of its image, computed from
-// the gradients of the hidden layer it enters.
+// the gradients of the hidden layer that receives the embedding.
 //
 // threads   one per sample
 // reads     batch, weights, v_activations [n_tiles, n_gradient_rows, 8]

@@ -23,7 +23,7 @@ fn main(@builtin(local_invocation_index) lane: u32) {
     let n_saturated = counts[0];
     if lane < arrayLength(&scales) {
         let n_bits = 32u - countLeadingZeros(largest[lane]);
-        // A level without gradients keeps its scale. Overflowed contributions were too large by an unknown factor.
+        // A level without gradients keeps its scale. After an overflow, the required change is unknown.
         var change = select(exp2(f32(TARGET_BITS) - f32(n_bits)), 1.0, n_bits == 0u);
         if n_saturated > 0u { change = min(change, 1.0) / 16.0; }
         scales[lane] = clamp(scales[lane] * change, 1.0 / MAX_SCALE, MAX_SCALE);

@@ -12,7 +12,7 @@ use keyframe::Keyframe;
 use std::path::Path;
 use std::sync::Arc;
 
-/// Neural fields as a method.
+/// Registry entry of neural fields.
 pub(crate) static ENTRY: MethodEntry = MethodEntry {
     name: NerfOptions::METHOD,
     description: "neural radiance field",
@@ -23,7 +23,7 @@ pub(crate) static ENTRY: MethodEntry = MethodEntry {
     single_file: None,
     needs_depth: false,
     learnable: ParamSet::IMAGE_POSES.union(ParamSet::IMAGE_GAINS),
-    exports: &[], // Other programs cannot read it.
+    exports: &[], // No other program can read the format.
     default_options: default_options::<NerfOptions>,
     check_options: |options| options.typed::<NerfOptions>().map(drop),
     start,

@@ -10,11 +10,11 @@ use serde::{Deserialize, Serialize};
 
 /// Depth readings per keyframe that are used to estimate the extent.
 const SAMPLES_PER_KEYFRAME: usize = 64;
-/// Fraction of the readings on each side that may be outside.
+/// Fraction of the readings, on each side along each axis, that may be outside.
 const OUTSIDE_FRAC: f64 = 0.02;
-/// Readings farther away than this multiple of the median are ignored: contraction covers them.
+/// Readings beyond this multiple of the median depth are ignored, because contraction covers them.
 const FAR_OVER_MEDIAN: f64 = 2.0;
-/// Radius without any information, meters.
+/// Radius if there is no information, meters.
 const DEFAULT_RADIUS_M: f64 = 1.0;
 const MIN_RADIUS_M: f64 = 0.01;
 /// A scene that extends beyond this many radii needs a new field: contraction leaves too little resolution there.
@@ -57,7 +57,7 @@ impl Extent {
     }
 
     fn without_depth<'a>(keyframes: impl Iterator<Item = &'a Keyframe>, cameras: &[Vector3<f64>]) -> Self {
-        // The point with the smallest sum of squared distances to the optical axes, weakly regularized towards the
+        // The point with the smallest sum of squared distances to the optical axes, weakly regularized toward the
         // cameras' mean.
         const CENTER_REGULARIZATION: f64 = 1e-3;
         let mean = cameras.iter().sum::<Vector3<f64>>() / cameras.len().max(1) as f64;
@@ -74,21 +74,21 @@ impl Extent {
         Self { center_m: center.into(), radius_m }
     }
 
-    /// Whether the scene has outgrown this extent, so that a field trained with it has too little resolution for
-    /// `other`.
+    /// Whether the scene has outgrown this extent, so that a field trained with it has too little resolution for the
+    /// extent `other`.
     pub fn is_outgrown_by(&self, other: &Self) -> bool {
         let offset = Vector3::from(self.center_m) - Vector3::from(other.center_m);
         offset.amax() + other.radius_m > MAX_REACH * self.radius_m
     }
 
-    /// A pose with its position relative to the center, in units of the radius.
+    /// Converts a pose: its position becomes relative to the center, in units of the radius.
     pub(crate) fn in_scene_units(&self, world_from_other: &Transform) -> Transform {
         let mut pose = *world_from_other;
         pose.translation.vector = (pose.translation.vector - Vector3::from(self.center_m)) / self.radius_m;
         pose
     }
 
-    /// A camera with all lengths in units of the radius.
+    /// Converts all lengths of a camera to units of the radius.
     pub(crate) fn camera_in_scene_units(&self, camera: &Camera) -> Camera {
         let shutter = camera.shutter.map(|shutter| Shutter {
             twist: Twist { linear_m_s: shutter.twist.linear_m_s / self.radius_m, ..shutter.twist },

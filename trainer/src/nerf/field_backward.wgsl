@@ -1,5 +1,5 @@
-// field_backward: gradients with respect to all layers from those of densities and colors, and on to the entries of the
-// grid. Grid gradients are summed as integers, so their order does not matter.
+// field_backward: backpropagates the gradients of densities and colors through all layers to the grid entries. Grid
+// gradients are summed as integers, so their order does not matter.
 //
 // threads   LANES per 32 samples
 // reads     batch, levels [n_levels], points, weights, activations [n_tiles, n_activation_rows, 8], v_log_density
@@ -28,7 +28,7 @@
 @group(0) @binding(9) var<storage, read_write> v_grid: array<atomic<i32>>;
 @group(0) @binding(10) var<storage, read_write> counts: array<atomic<u32>>;
 
-// Largest contribution: 2^7 of them fit into a sum.
+// Largest contribution. 2^7 contributions of this size fit into a sum.
 const MAX_ABS = 16777216.0;
 const NO_RELU = 0xffffffffu;
 const NOT_STORED = 0xffffffffu;
@@ -44,7 +44,7 @@ struct Layer {
     first_weight: u32,
     n_in: u32,
     n_out: u32,
-    relu_row: u32,          // the layer's inputs, to which a ReLU was applied; NO_RELU: none was
+    relu_row: u32,          // row of the layer's inputs if a ReLU was applied to them, else NO_RELU
     stored_row: u32,         // NOT_STORED: the gradients are not needed later
 }
 
@@ -59,7 +59,7 @@ fn layer_of(ix: u32) -> Layer {
     }
 }
 
-// Gradients with respect to a layer's inputs, after its ReLU.
+// Gradients with respect to a layer's inputs, backpropagated through the ReLU of the inputs.
 fn layer_output(layer: Layer, tile: u32, row: u32, part: u32, sum: vec4f) -> vec4f {
     var v = sum;
     if layer.relu_row != NO_RELU {
@@ -117,8 +117,8 @@ fn add(entry: u32, gradient: vec2f) {
     }
 }
 
-// Scatters gradients from the first bank to the grid. Four adjacent samples are summed first while they are in the same
-// cell.
+// Scatters gradients from the first bank to the grid. Of four adjacent samples, those in the same cell are summed
+// first.
 fn scatter(tile: u32, lane: u32) {
     for (var item = lane; item < arrayLength(&levels) * PARTS; item += LANES) {
         let level_ix = item / PARTS;
@@ -149,7 +149,7 @@ fn scatter(tile: u32, lane: u32) {
 fn work(tile: u32, lane: u32) {
     if tile * TILE < batch.n_samples {
         seed_color_gradients(tile, lane);
-        // A loop keeps a single copy of the long code of a layer.
+        // The loop avoids several copies of the long code of a layer.
         for (var ix = 0u; ix < N_LAYERS; ix++) {
             if ix == N_COLOR_LAYERS { seed_density_gradients(tile, lane); }
             evaluate_layer(layer_of(ix), tile, lane);

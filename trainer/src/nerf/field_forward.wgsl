@@ -59,7 +59,7 @@ fn store_inputs(tile: u32, bank: u32, first_row: u32, n_rows: u32, lane: u32) {
 }
 
 // Interpolates grid features at the points into the first bank. Neighboring threads process neighboring samples of one
-// level, which are in the same cells of coarse levels.
+// level, which share the cells of coarse levels.
 fn interpolate_features(tile: u32, lane: u32) {
     let n_levels = arrayLength(&levels);
     for (var item = lane; item < n_levels * TILE; item += LANES) {
@@ -138,7 +138,7 @@ fn gather_color_inputs(tile: u32, lane: u32) {
 fn work(tile: u32, lane: u32) {
     if tile * TILE < batch.n_samples {
         interpolate_features(tile, lane);
-        // A loop keeps a single copy of the long code of a layer.
+        // The loop avoids several copies of the long code of a layer.
         for (var ix = 0u; ix < select(N_DENSITY_LAYERS, N_LAYERS, COLORS); ix++) {
             if ix == N_DENSITY_LAYERS { gather_color_inputs(tile, lane); }
             evaluate_layer(layer_of(ix), tile, lane);

@@ -21,11 +21,11 @@ use kinematics::random::{hash, unit_from_bits};
 use rayon::prelude::*;
 use std::sync::Arc;
 
-/// Maximum number of steps per submit: their rays are on the GPU at once.
+/// Maximum number of steps per submit. The rays of all these steps are on the GPU at once.
 pub(crate) const STEPS_PER_SUBMIT: usize = 8;
 /// Steps between two updates of the occupancy.
 const OCCUPANCY_UPDATE_PERIOD: u64 = 16;
-/// First step that updates the occupancy if there is depth: until then, depth is more reliable than the field.
+/// First step that updates the occupancy if there is depth. Until then, depth is more reliable than the field.
 const FIRST_OCCUPANCY_UPDATE_WITH_DEPTH: u64 = 128;
 /// Factor on a cell's previous occupancy at each update.
 const OCCUPANCY_DECAY: f32 = 0.7;
@@ -35,17 +35,16 @@ const UPDATED_FRAC: f64 = 0.25;
 const MAX_SAMPLES_OVER_MEAN: u32 = 4;
 /// Samples per round for a ray of a picture; `MAX_SAMPLES_PER_ROUND` of `find_samples.wgsl`.
 const SAMPLES_PER_ROUND: u32 = 8;
-/// Rounds before checking whether any ray is unfinished, and the maximum number of checks, which limits the length of
-/// rays.
+/// Rounds per check for unfinished rays, and maximum number of checks, which limits the length of rays.
 const ROUNDS_PER_SUBMIT: u32 = 4;
 const MAX_SUBMITS: u32 = 64;
 /// Initial range of the entries (Mueller et al. 2022, section 4).
 const INITIAL_ENTRY_RANGE: f64 = 1e-4;
-/// Differences of distance beyond this have no gradient, in units of the scene radius.
+/// Distance residuals beyond this have no gradient, in units of the scene radius.
 const DISTANCE_CLIP: f32 = 0.5;
 /// Relative error of a depth camera.
 const DEPTH_BAND_FRAC: f32 = 0.01;
-/// Near end of the distances compared by the distortion loss, in units of the scene radius.
+/// Minimum distance in the distortion loss, in units of the scene radius.
 const DISTORTION_NEAR: f32 = 0.05;
 /// Initial step of an image's rotation (radians) and translation (units of the scene radius): observed surfaces are
 /// roughly a third of a radius away.
@@ -58,7 +57,7 @@ const IMAGE_PARAM_DECAY: f32 = 5e-4;
 /// Initial scale of gradients, before their magnitudes are known.
 const INITIAL_GRADIENT_SCALE: f32 = 1_048_576.0;
 
-/// Index of the parameters of a picture in its buffer, which holds no others.
+/// Index of a picture's parameters in their buffer, which holds no others.
 const PICTURE_EMBEDDING_IX: u32 = 0;
 
 /// GPU state of one field.
@@ -165,8 +164,8 @@ impl FieldTrainer {
         grids.into_iter().chain([&field.weights, &moments.weights]).map(Buffer::bytes).sum()
     }
 
-    /// Records one training step on `rays` as the `slot_ix`-th of a submit. `learned`: which image parameters it
-    /// optimizes.
+    /// Records one training step on `rays` as step `slot_ix` of a submit. The step optimizes the image parameters in
+    /// `learned`.
     pub(crate) fn record_step(
         &mut self,
         gpu: &Gpu,
@@ -209,7 +208,7 @@ impl FieldTrainer {
         Ok(())
     }
 
-    /// Renders rays with their given poses and these appearance embeddings per image, without training. No submit may
+    /// Renders rays with their given poses and with one appearance embedding per image, without training. No submit may
     /// be in flight.
     pub(crate) fn render_rays(
         &mut self,
@@ -249,8 +248,7 @@ impl FieldTrainer {
             .collect())
     }
 
-    /// Allocates parameters for `n_images` images, keeping existing values, and sets which of them are optimized from
-    /// now on.
+    /// Allocates parameters for `n_images` images, keeps existing values, and sets which parameters are optimized.
     pub(crate) fn allocate_images(&mut self, gpu: &Gpu, n_images: usize, learned: ParamSet) -> Result<(), Error> {
         let n_images = u32::try_from(n_images).expect("few images");
         let n_allocated = self.images.as_ref().map_or(0, |images| images.n_images);
@@ -277,7 +275,7 @@ impl FieldTrainer {
         Ok(())
     }
 
-    /// Initializes images from the `first_ix`-th on with these appearance embeddings and without pose corrections.
+    /// Sets the appearance embeddings of images `first_ix` onward, and their pose corrections to zero.
     pub(crate) fn initialize_images(&self, gpu: &Gpu, first_ix: usize, embeddings: &[[f64; EMBEDDING_DIM]]) {
         if let Some(images) = &self.images {
             let row_bytes = IMAGE_PARAM_STRIDE * size_of::<ImageParam>();
@@ -289,8 +287,8 @@ impl FieldTrainer {
         }
     }
 
-    /// For each of the first images: rotation (rotation vector in world, radians), translation (in world, units of the
-    /// scene radius) and appearance embedding. Empty if no image parameters are optimized.
+    /// Parameters of the first `n_images` images: rotation (rotation vector in world, radians), translation (in world,
+    /// units of the scene radius) and appearance embedding. Empty if no image parameters are optimized.
     pub(crate) fn image_param_values(
         &self,
         gpu: &Gpu,
@@ -307,7 +305,7 @@ impl FieldTrainer {
         self.images = None;
     }
 
-    /// Removes an image; later images move up by one.
+    /// Removes an image and decrements the index of each later image.
     pub(crate) fn remove_image(&mut self, gpu: &Gpu, image_ix: usize) -> Result<(), Error> {
         let Some(images) = &self.images else { return Ok(()) };
         let mut image_params = read_image_params(gpu, images, images.n_images as usize)?;
@@ -332,7 +330,7 @@ impl FieldTrainer {
         Ok(())
     }
 
-    /// Writes the inputs of a step on `rays`, as the `slot_ix`-th of a submit.
+    /// Writes the inputs of step `slot_ix` of a submit, which trains on `rays`.
     fn write_slot(
         &mut self,
         gpu: &Gpu,
@@ -370,14 +368,14 @@ impl FieldTrainer {
         Ok(())
     }
 
-    /// Records the networks as pictures use them, on the samples of the last step.
+    /// Records the forward pass that pictures use, on the samples of the last step.
     pub(crate) fn record_colors(&mut self, gpu: &Gpu) {
         let Self { compiled, field, samples, slots, passes: list, .. } = self;
         let image_params = &field.no_image_params;
         FieldPasses { gpu, pipelines: &compiled.pipelines, field, samples, slot: &slots[0], image_params }.colors(list);
     }
 
-    /// Submits the recorded passes; the returned read completes with them.
+    /// Submits the recorded passes. The returned read completes when they do.
     pub(crate) fn submit(&mut self, gpu: &Gpu) -> PendingRead {
         self.passes.submit_reading(gpu, &[(&self.samples.batch, 8)])
     }
@@ -387,7 +385,7 @@ impl FieldTrainer {
         self.passes.submit_timed(gpu)
     }
 
-    /// Halves the size of cells and steps; the new cells inherit the occupancy of the old ones. No submit may be in
+    /// Halves the size of cells and steps. The new cells inherit the occupancy of the old ones. No submit may be in
     /// flight.
     pub(crate) fn refine_cells(&mut self, gpu: &Gpu) -> Result<(), Error> {
         let n = self.sizes.nerf_budget.n_cells as usize;
@@ -396,7 +394,7 @@ impl FieldTrainer {
         self.sizes.can_refine = false;
         self.passes.clear_bindings();
         self.occupancy = Occupancy::new(gpu, &occupancy_update_of(&self.sizes.nerf_budget), self.sizes.has_depth)?;
-        // A step of half the length has half the opacity; negative values mean that the cell was never updated.
+        // A step of half the length has half the opacity. Negative values mark cells that were never updated.
         let half_step_opacity =
             |cell_occupancy: f32| if cell_occupancy > 0.0 { 0.5 * cell_occupancy } else { cell_occupancy };
         let row = |row: usize| {
@@ -446,7 +444,7 @@ impl FieldTrainer {
 
     /// Renders a pinhole view, given in units of the scene radius, with an appearance embedding.
     ///
-    /// Rays are sampled in rounds of a few samples, until all are opaque or have no occupied cells left.
+    /// Rays are sampled in rounds of a few samples, until all rays are opaque or have no occupied cells left.
     pub(crate) fn draw(
         &mut self,
         gpu: &Gpu,
@@ -513,7 +511,7 @@ pub(crate) struct RayColor {
     pub(crate) rgb: [f64; 3],
 }
 
-/// A random background: the field must not use the background to explain the images.
+/// A random background, so that the field cannot use the background to explain the images.
 fn background(options: &ModelOptions<NerfOptions>, step: u64) -> [f32; 3] {
     [0, 1, 2].map(|ix| f32_of(unit_from_bits(hash(options.common.seed ^ hash(step << 2 | ix)))))
 }

@@ -1,4 +1,4 @@
-// find_samples: the next samples of a picture's rays, at most MAX_SAMPLES_PER_ROUND each.
+// find_samples: finds the next samples of the rays of a picture, at most MAX_SAMPLES_PER_ROUND per ray.
 //
 // threads   one per ray
 // reads     march, occupied (one bit per cell)

@@ -1,10 +1,10 @@
-// hint_cells: applies hints from images to cells of the occupancy in which no sample was taken yet.
+// hint_cells: applies hints from images to occupancy cells that have not been sampled yet.
 //
 // threads   one per hint
 // reads     hints [n]: cell index, with the kind of hint in the highest two bits, see below
 // writes    cell_occupancy
 //
-// Hints are sorted by priority, and each kind has its own dispatch: a cell may have several hints.
+// Hints are sorted by priority, and each kind has its own dispatch, because a cell may have several hints.
 
 #import folded
 
@@ -17,7 +17,7 @@ const UNBOUNDED = 0u; // Possibly occupied, but too far or too dark for the dept
 const FREE = 1u;
 const SURFACE = 2u;
 
-// Values of a cell outside all views, of one observed to be free, and of one that is sampled until its first update.
+// Values of a cell that is outside all views, observed to be free, or sampled until its first update.
 const OUTSIDE_VIEWS = 0.0;
 const EMPTY = 1e-30;
 const NEVER_UPDATED = -1.0;

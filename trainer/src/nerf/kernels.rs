@@ -40,7 +40,7 @@ macro_rules! layers {
         ]
     };
 }
-/// Variants in f32, and with cooperative matrices in f16.
+/// Variants with f32 layers, and with f16 cooperative matrices.
 const FULL: &[Source] = layers!("full");
 const HALF: &[Source] = layers!("half");
 
@@ -109,28 +109,28 @@ pub(crate) const N_TILE: u32 = 32;
 /// Tiles of samples per partial sum of weight gradients.
 pub(crate) const CHUNK_TILES: u32 = 16;
 pub(crate) const N_CHUNK: u32 = CHUNK_TILES * N_TILE;
-/// Threads per tile with cooperative matrices: whole subgroups of any size.
+/// Threads per tile with cooperative matrices: a multiple of every subgroup size.
 const HALF_LANES: u32 = 128;
 /// Maximum number of rows of a layer.
 const MAX_ROWS: u32 = 64;
 /// Rows of a cooperative matrix.
 const MATRIX: u32 = 16;
-/// Outputs of the first network, and colors, in the kernels.
+/// Number of outputs of the first and of the second network, in the kernels.
 const N_DENSITY_OUT: u32 = 16;
 const N_COLORS: u32 = 4;
 
-/// Widths of both networks in the kernels: multiples of four, and of the matrix size with cooperative matrices. Stored
-/// fields have widths that are multiples of both, so that files fit all adapters.
+/// Layer widths of both networks in the kernels: multiples of four, or of the matrix size with cooperative matrices.
+/// Saved fields use multiples of both, so that files work on all adapters.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct Widths {
     pub(crate) n_features: u32,
     pub(crate) n_hidden: u32,
     pub(crate) n_color_in: u32,
     pub(crate) embedding_dim: u32,
-    /// Whether layers use f16 cooperative matrices ([`crate::gpu::Optional::half_matrices`]): their inputs are then
+    /// Whether layers use f16 cooperative matrices ([`crate::gpu::Optional::half_matrices`]). If so, their inputs are
     /// f16.
     pub(crate) is_half_precision: bool,
-    /// Widths without matrices of features, hidden layers and inputs of the second network.
+    /// Widths of features, hidden layers and inputs of the second network, without padding for matrices.
     used: [u32; 3],
 }
 
@@ -160,12 +160,12 @@ impl Widths {
         layers_of([self.n_features, self.n_hidden, self.n_color_in])
     }
 
-    /// The layers without matrices: weights outside them start at zero and stay zero.
+    /// The layers without padding for matrices. Weights in the padding start at zero and stay zero.
     pub(crate) fn used_layers(&self) -> [[u32; 2]; 5] {
         layers_of(self.used)
     }
 
-    /// Weights of all layers.
+    /// Number of weights of all layers.
     pub(crate) fn n_weights(&self) -> u32 {
         self.layers().iter().map(|[n_in, n_out]| n_in * n_out).sum()
     }
@@ -175,7 +175,7 @@ impl Widths {
         if self.is_half_precision { MATRIX } else { N_COLORS }
     }
 
-    /// Weights of all layers with padding, and sums of their gradients: those of padding outputs come last.
+    /// Number of weights of all layers, or of their gradient sums, with padding. Padding outputs come last.
     pub(crate) fn n_padded_weights(&self) -> u32 {
         self.n_weights() + (self.n_colors() - N_COLORS) * self.n_hidden
     }
@@ -203,7 +203,7 @@ pub(crate) struct FieldPipelines {
     pub(crate) place_samples: Pipeline,
     pub(crate) write_samples: Pipeline,
     pub(crate) find_samples: Pipeline,
-    /// One per kind of hint, in the order they are applied.
+    /// One per kind of hint, in the order in which they are applied.
     pub(crate) hint_cells: [Pipeline; 3],
     pub(crate) sample_cells: Pipeline,
     pub(crate) update_cells: Pipeline,
@@ -257,7 +257,7 @@ impl FieldPipelines {
                 &with(&kind),
             )
         };
-        // Each thread sums 16 weights.
+        // Each thread sums the gradients of 16 weights.
         let max_weights = widths.layers().iter().map(|[n_in, n_out]| n_in * n_out).max().expect("five layers");
         let chunk = ("CHUNK_TILES", f64::from(CHUNK_TILES));
         let sums =

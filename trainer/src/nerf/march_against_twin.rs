@@ -1,4 +1,4 @@
-//! Tests of samples along rays against their twin.
+//! Tests of ray sampling against its twin.
 
 use super::buffers::{FieldBuffers, FieldMoments, Occupancy, RaySlot, SampleBuffers};
 use super::kernels::{FieldPipelines, Widths};
@@ -12,11 +12,11 @@ use crate::mismatches::Mismatches;
 use crate::random::F32Random;
 
 const N_CELLS: u32 = 64;
-/// More than a workgroup scans at once.
+/// More rays than a workgroup scans at once.
 const N_RAYS: u32 = 300;
 const CAPACITY: u32 = 16_384;
 const MARCH: March = March { step: 0.03125, max_samples: 12, n_cells: N_CELLS as usize };
-/// Margin to a cell's side, in cells, below which f32 may select the neighboring cell.
+/// Distance to a cell's side, in cells, below which f32 may select the neighboring cell.
 const MIN_MARGIN: f64 = 1e-4;
 
 /// Marks half of the cells in half of the blocks, which are 4 cells wide.

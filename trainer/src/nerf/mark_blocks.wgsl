@@ -1,8 +1,8 @@
-// mark_blocks: which blocks contain an occupied cell.
+// mark_blocks: marks the blocks that contain an occupied cell.
 //
 // threads   one per 32 blocks
 // reads     occupancy_update (n_cells)
-// writes    occupied (behind the cells: one bit per block)
+// writes    occupied (after the cells: one bit per block)
 
 #import folded
 #import occupancy_update
@@ -14,7 +14,7 @@
 fn any_in(block: vec3u, size: u32) -> bool {
     for (var z = block.z * size; z < (block.z + 1u) * size; z++) {
         for (var y = block.y * size; y < (block.y + 1u) * size; y++) {
-            // The cells of a row are in one word: block sizes are powers of two up to 32.
+            // The cells of a row are in one word, because block sizes are powers of two up to 32.
             let first = block.x * size + occupancy_update.n_cells * (y + occupancy_update.n_cells * z);
             let row = occupied[first / 32u] >> (first % 32u);
             if (row & (0xffffffffu >> (32u - size))) != 0u { return true; }

@@ -1,4 +1,4 @@
-// mark_cells: which cells are sampled: those that are opaque enough, and those that were never updated.
+// mark_cells: marks the cells to sample: sufficiently opaque cells, and cells that were never updated.
 //
 // threads   one per 32 cells
 // reads     cell_occupancy, occupancy_sum
@@ -13,7 +13,7 @@
 @group(0) @binding(3) var<storage, read_write> steps: array<u32>;
 
 // Cells with a lower opacity per step are skipped. If the mean opacity is low, the threshold is half of the mean
-// instead.
+// opacity.
 const MIN_OCCUPANCY = 0.02;
 
 @compute @workgroup_size(64)

@@ -29,11 +29,11 @@ use std::time::Instant;
 
 /// Distance at which rays begin, in units of the scene radius.
 const NEAR_DISTANCE: f32 = 0.03;
-/// Occupancy cells are refined after this fraction (1 / divisor) of the planned steps: before the first trial, because
-/// trials compare fields of one size.
+/// Occupancy cells are refined after this fraction (1 / divisor) of the planned steps. This is before the first trial,
+/// because trials compare fields of the same size.
 const REFINE_DIVISOR: u64 = 10;
-/// On a software adapter, a picture of 640x480 takes tens of seconds early in training. Every ninth pixel is enough for
-/// depth.
+/// Depth stride on a software adapter, where a 640x480 picture takes tens of seconds early in training. Every ninth
+/// pixel is enough for depth.
 const SOFTWARE_DEPTH_STRIDE: u32 = 3;
 
 /// A neural radiance field trained on keyframes: a hash grid and two small networks, rendered along rays.
@@ -45,9 +45,9 @@ pub struct NerfModel {
     field: Option<(Extent, FieldTrainer)>,
     /// Shared by all fields that this model creates.
     compiled: Option<Arc<Compiled>>,
-    /// Keyframes were added since the extent was last computed.
+    /// Whether keyframes were added since the extent was last computed.
     is_extent_stale: bool,
-    /// Number of images, from the first, whose hints were applied to the field.
+    /// Number of leading images whose hints were applied to the field.
     n_hinted: usize,
     submits: Submits,
     /// Image parameters that are optimized together with the field.
@@ -55,9 +55,9 @@ pub struct NerfModel {
     trials: Trials,
     /// Validation images, used for training after all trials are finished.
     validation_images: Vec<RayImage>,
-    /// Camera corrections of the saved field that was loaded.
+    /// Camera corrections of a loaded field.
     loaded_corrections: BTreeMap<String, CameraCorrection>,
-    /// Camera corrections since the last step; `None` if they must be computed.
+    /// Camera corrections after the last step; `None` if they must be recomputed.
     corrections: Option<BTreeMap<String, CameraCorrection>>,
     step: u64,
     /// Steps of rejected trials.
@@ -186,8 +186,8 @@ impl NerfModel {
         (self.options.common.n_planned_steps / REFINE_DIVISOR).max(1)
     }
 
-    /// Refines the cells when due: coarse cells need fewer updates at first, fine ones separate empty space better
-    /// later.
+    /// Refines the cells when due. Coarse cells need fewer updates at first; fine cells later separate empty space
+    /// better.
     fn refine_cells_when_due(&mut self) -> Result<(), Error> {
         let is_refinement_due = self.step >= self.refinement_step();
         if !is_refinement_due || !self.field.as_ref().is_some_and(|(_, field_trainer)| field_trainer.sizes.can_refine) {
@@ -306,7 +306,7 @@ impl Method for NerfModel {
             return Ok(0);
         }
         self.advance_trials_when_due()?;
-        // Validation images may have joined: start on them before the next step rather than after the next submit.
+        // Validation images may have become training images. Use them from the next step on.
         self.begin()?;
         let max_steps = self.steps_to_finer_cells().min(self.steps_to_trial());
         let n_steps = n.min(self.steps_per_submit()).min(max_steps);
@@ -343,7 +343,7 @@ impl Method for NerfModel {
     }
 
     fn render(&mut self, request: &RenderRequest) -> Result<Picture, Error> {
-        // Rendering must not create a field: views would then decide which keyframes it starts with.
+        // Rendering must not create a field: the times of pictures would then determine its initial keyframes.
         self.finish_in_flight()?;
         let embedding = self.embedding_of(request.appearance_of.as_ref())?;
         projections::render(request, |camera| self.draw(request, camera, embedding))

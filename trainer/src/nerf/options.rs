@@ -3,11 +3,11 @@
 use crate::model_options::MethodOptions;
 use serde::{Deserialize, Serialize};
 
-/// Options of a [`super::NerfModel`], besides those that all methods share.
+/// Options specific to a [`super::NerfModel`].
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct NerfOptions {
-    /// Weight of the absolute difference of distances, per scene radius, relative to the squared difference of colors.
+    /// Weight of the absolute distance error, per scene radius, relative to the squared color error.
     pub distance_weight: f64,
     /// Weight of the line-of-sight loss, which penalizes opacity away from the measured depth.
     pub line_of_sight: f64,
@@ -69,8 +69,8 @@ impl NerfBudget {
 }
 
 impl NerfBudget {
-    /// Halves the size of cells and steps if they are those of [`Self::FULL`]. Others stay: refinement is too slow on
-    /// software adapters, and finer cells need too much memory.
+    /// Halves the size of cells and steps if they are those of [`Self::FULL`]. Does not refine other sizes: refinement
+    /// is too slow on software adapters, and even finer cells need too much memory.
     #[must_use]
     pub(crate) fn refined(self) -> Self {
         if self.n_cells != Self::FULL.n_cells {

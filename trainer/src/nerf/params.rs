@@ -14,7 +14,7 @@ pub(crate) struct Batch {
 }
 
 impl Batch {
-    /// A batch of rays whose samples are not placed yet.
+    /// A batch of rays whose samples have not been placed yet.
     pub(crate) fn of(n_rays: u32) -> Self {
         Self { n_rays, n_samples: 0, max_samples: 0, unused: 0 }
     }
@@ -140,8 +140,8 @@ pub(crate) struct ImageParamRule {
 }
 
 /// One of the [`IMAGE_PARAM_STRIDE`] parameters of an image: value, Adam's two moments, and the number of steps taken.
-/// The parameters are three of the rotation, three of the translation, and the appearance embedding from [`EMBEDDING`]
-/// on, as in `shared/image_params.wgsl`.
+/// The first three parameters are the rotation, the next three the translation, and the appearance embedding starts at
+/// [`EMBEDDING`], as in `shared/image_params.wgsl`.
 pub(crate) type ImageParam = [f32; 4];
 pub(crate) const IMAGE_PARAM_STRIDE: usize = 9;
 pub(crate) const EMBEDDING: usize = 6;

@@ -19,7 +19,7 @@ pub(crate) struct FieldPasses<'a> {
     pub(crate) field: &'a FieldBuffers,
     pub(crate) samples: &'a SampleBuffers,
     pub(crate) slot: &'a RaySlot,
-    /// Parameters of the images that the rays belong to.
+    /// Parameters of the images to which the rays belong.
     pub(crate) image_params: &'a Buffer,
 }
 
@@ -62,7 +62,7 @@ fn groups(n: u32, size: u32) -> u64 {
 }
 
 impl FieldPasses<'_> {
-    /// Finds the segments of rays in occupied cells.
+    /// Counts the segments of rays in occupied cells.
     pub(crate) fn count(&self, list: &mut Passes, occupancy: &Occupancy) {
         let Self { gpu, pipelines, samples, slot, .. } = *self;
         let found = [

@@ -1,4 +1,4 @@
-// picture_rays: the rays of a range of pixels of a view.
+// picture_rays: generates the rays for a range of pixels of a view.
 //
 // threads   one per ray
 // reads     batch, march (first_ray: the first pixel), view (in units of the scene radius around its center)

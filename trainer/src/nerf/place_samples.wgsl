@@ -1,4 +1,4 @@
-// place_samples: range of samples of each ray, and a limit of samples per ray at which all rays fit.
+// place_samples: chooses the sample range of each ray, and a limit of samples per ray so that all rays fit.
 //
 // threads   256, in one workgroup
 // reads     march, n_found

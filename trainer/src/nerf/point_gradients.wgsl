@@ -1,4 +1,4 @@
-// point_gradients: gradients with respect to the position of every sample, from those of its grid features.
+// point_gradients: gradients with respect to the position of every sample, computed from its feature gradients.
 //
 // threads   one per sample
 // reads     batch, levels [n_levels], points [n_samples], grid [n_entries], rays, spans, v_activations [n_tiles,
@@ -35,7 +35,7 @@ fn gradient_in(level: Level, at: vec3f, v_features: vec2f) -> vec3f {
     return gradient * f32(level.n_cells);
 }
 
-// Gradient with respect to the point in world, from that in the unit cube.
+// Converts a gradient with respect to the point in the unit cube to one with respect to the point in world.
 fn contract_backward(at: vec3f, v: vec3f) -> vec3f {
     let size = abs(at);
     let max_abs = max(size.x, max(size.y, size.z));

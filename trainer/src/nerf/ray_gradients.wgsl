@@ -1,12 +1,12 @@
-// ray_gradients: gradients with respect to rotation and translation of every ray, from those of the positions of its
-// samples.
+// ray_gradients: gradients with respect to rotation and translation of every ray, computed from the gradients of its
+// sample positions.
 //
 // threads   one per ray
 // reads     batch, rays, spans, v_points [n_samples]
 // writes    v_rays [n_rays, 2] (with respect to rotation about the ray's origin; to translation)
 // twin      nerf/reference/pose.rs
 //
-// The effect of rotation on the view direction of colors is neglected: it is small compared with the effect on
+// Neglects the effect of rotation on the view direction of colors, which is small compared with the effect on
 // positions.
 
 #import folded

@@ -14,11 +14,11 @@ use std::sync::{Arc, OnceLock};
 const RAYS_PER_TASK: usize = 512;
 /// Attempts to find a pixel that is not masked.
 const MAX_ATTEMPTS: u64 = 4;
-/// End of rays without a reading: contraction leaves no resolution far beyond this.
+/// End of rays without a reading. Contraction leaves no resolution far beyond this distance.
 const MAX_DISTANCE: f32 = 1e3;
 
-/// How far behind a reading a ray is sampled, in units of the scene radius and as a fraction of its distance. The
-/// reading gives no information about the space farther back.
+/// Distance behind a reading up to which a ray is sampled: an offset in units of the scene radius, and a fraction of
+/// the reading's distance. The space farther back is unobserved.
 const BEHIND_SURFACE: f64 = 0.03;
 const BEHIND_SURFACE_FRAC: f64 = 0.03;
 
@@ -48,7 +48,7 @@ impl RayImage {
         let mut in_camera = Vector3::new(along(x, 0), along(y, 1), 1.0);
         let mut origin_m = Vector3::zeros();
         if let Some(twist) = &self.keyframe.twist {
-            // The camera motion moves a point by -tau (v + w x p) in the camera; the ray undoes that.
+            // The camera motion moves a point by -tau (v + w x p) in the camera; the ray applies the inverse.
             let tau_secs = ((y as f64 + 0.5) / f64::from(*height) - 0.5) * self.keyframe.readout_secs;
             in_camera += twist.angular_rad_s.cross(&in_camera) * tau_secs;
             origin_m = twist.linear_m_s * tau_secs;
@@ -82,7 +82,7 @@ impl RayImage {
     }
 }
 
-/// How rays are sampled.
+/// Parameters for sampling the rays of a step.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct RaySampling {
     pub(crate) seed: u64,
@@ -92,7 +92,7 @@ pub(crate) struct RaySampling {
     pub(crate) begin: f32,
 }
 
-/// Samples the rays of a step evenly from all images, in the order of the images.
+/// Draws the rays of a step evenly from all images, in the order of the images.
 pub(crate) fn draw(images: &[RayImage], extent: &Extent, draw: &RaySampling) -> Vec<params::Ray> {
     if images.is_empty() {
         return Vec::new();

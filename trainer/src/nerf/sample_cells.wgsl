@@ -1,4 +1,4 @@
-// sample_cells: a random point in each of the occupancy cells that this update evaluates.
+// sample_cells: chooses a random point in each occupancy cell that this update evaluates.
 //
 // threads   one per point
 // reads     occupancy_update, steps ([1]: updates so far)

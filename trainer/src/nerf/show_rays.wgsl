@@ -32,7 +32,7 @@ struct Backdrop {
 @group(0) @binding(10) var<storage, read_write> light: array<vec4f>;
 
 const MIN_COVERAGE = 1e-3;
-// Rays with less transmittance are finished: it is half of the smallest difference of a color.
+// Rays with less transmittance are finished. This is half of the smallest difference between 8-bit colors.
 const MIN_TRANSMITTANCE = 1.0 / 512.0;
 
 @compute @workgroup_size(64)

@@ -12,9 +12,9 @@ use serde::{Deserialize, Serialize};
 const N_CELLS_COARSEST: u32 = 16;
 /// Ratio of the resolutions of adjacent levels.
 const LEVEL_GROWTH: f64 = 1.5;
-/// Width of the finest cells in pixels: finer ones would fit noise.
+/// Width of the finest cells in pixels. Finer cells would fit noise.
 const PIXELS_PER_CELL: f64 = 1.5;
-/// Pixels of an image per entry of a level: images overlap, and surfaces occupy few of a level's cells.
+/// Pixels of an image per entry of a level. Images overlap, and surfaces occupy few cells of a level.
 const PIXELS_PER_ENTRY: f64 = 0.5;
 /// Limits of the number of levels.
 pub(crate) const MIN_LEVELS: u32 = 4;
@@ -39,7 +39,7 @@ pub(crate) struct Sizes {
     pub(crate) nerf_budget: NerfBudget,
 }
 
-/// Whether most images have depth for most of their pixels: then few cells are occupied, and finer ones cost little.
+/// Whether most images have depth for most pixels. If so, few cells are occupied, and refining them costs little.
 fn has_dense_depth<'a>(keyframes: impl Iterator<Item = &'a Keyframe>) -> bool {
     /// Only every `STRIDE`-th reading is checked.
     const STRIDE: usize = 61;
@@ -52,7 +52,7 @@ fn has_dense_depth<'a>(keyframes: impl Iterator<Item = &'a Keyframe>) -> bool {
 }
 
 impl Sizes {
-    /// Chooses levels down to the size of a pixel, and entries for the number of pixels in an image, within the limits.
+    /// Chooses levels down to the size of a pixel, and an entry count for the pixels of an image, within the limits.
     pub(crate) fn choose<'a>(
         options: &ModelOptions<NerfOptions>,
         nerf_budget: NerfBudget,

@@ -281,7 +281,7 @@ fn drifting_poses_are_corrected() {
     train_until(&mut model, 600);
     let after_m = mean_position_error_m(&mut model, &drifted_keyframes);
     assert!(model.report()[0].kept, "{:?}", model.report());
-    // There are only a few hundred small steps, and a common motion of all images is unobservable: 15 mm became 9.
+    // A few hundred small steps cannot remove all drift, and common motion is unobservable: 15 mm became 9.
     assert!(after_m < 0.75 * before_m, "{before_m} m, then {after_m} m");
 
     let (mut resumed, rest) = NerfModel::resume(gpu(), &checkpoint, &drifted_keyframes).unwrap();
@@ -320,8 +320,8 @@ fn drifting_poses_are_corrected() {
     );
 }
 
-/// Changing light is modeled during training if a trial finds a significant gain. Images not used for training are
-/// rendered with the interpolated embedding of their neighbors in time, and others with the mean embedding.
+/// Changing light is modeled during training if a trial finds a significant gain. Images that were not trained on use
+/// an embedding interpolated in time; pictures without a time use the mean embedding.
 #[test]
 fn changing_light_is_modeled() {
     let options = |cameras| with_cameras(cameras, 480);

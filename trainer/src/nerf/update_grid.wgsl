@@ -2,7 +2,7 @@
 //
 // threads   one per entry
 // reads     rule, step_scale, levels [n_levels], scales [n_levels]
-// writes    grid, moments [n_entries] (first of both, second of both), v_grid (reset to zero), largest [n_levels]
+// writes    grid, moments [n_entries] (two first, two second), v_grid (reset to zero), largest [n_levels]
 // twin      optim/reference.rs
 // source    Mueller et al. 2022, section 4 (entries without a gradient stay unchanged)
 
@@ -34,7 +34,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
         if ix >= levels[above].begin { level = above; }
     }
     let max_abs = max(abs(sum.x), abs(sum.y));
-    atomicMax(&largest[level], u32(max_abs)); // The order of a maximum does not matter.
+    atomicMax(&largest[level], u32(max_abs)); // A maximum does not depend on the order.
     let v = vec2f(sum) / scales[level];
     let moment = mix(vec4f(v, v * v), moments[ix], rule.betas.xxyy);
     moments[ix] = moment;

@@ -7,7 +7,7 @@
 // writes    image_params [n_images, IMAGE_PARAM_STRIDE]
 // twin      nerf/reference/pose.rs, nerf/reference/field.rs, optim/reference.rs
 //
-// Weight decay keeps the parameters of an image near zero unless the images contradict that.
+// Weight decay keeps the parameters of an image near zero unless the images show otherwise.
 
 #import folded
 #import ray_batch

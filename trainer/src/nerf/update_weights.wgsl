@@ -1,6 +1,6 @@
 // update_weights: sums the gradients of the weights of all layers over the chunks of samples, and takes one Adam step.
 //
-// threads   256 per 16 times 4 weights: 16 threads share the chunks
+// threads   256 per 16 vec4 of weights: 16 threads per vec4 share the chunks
 // reads     rule, step_scale, batch, partial_sums [n_chunks, N_SUMS]
 // writes    weights [n_weights], moments [n_weights / 4, 2] (first and second of 4 weights)
 // twin      optim/reference.rs

@@ -5,7 +5,7 @@
 // writes    partial_sums [n_chunks, n_weights]
 // twin      nerf/reference/network.rs
 //
-// A thread computes 4 outputs and 4 inputs of the layer. If threads are left over, several share the samples.
+// A thread computes 4 outputs and 4 inputs of the layer. If there are more threads, several share the samples.
 
 #import folded
 #import ray_batch

@@ -1,4 +1,4 @@
-// weight_gradients_half: like weight_gradients, with cooperative matrices.
+// weight_gradients_half: variant of `weight_gradients` with cooperative matrices.
 //
 // threads   256 per layer and chunk of CHUNK_TILES * 32 samples
 // reads     batch, activations [n_tiles, n_activation_rows, 8], v_activations [n_tiles, n_gradient_rows, 8]
@@ -43,7 +43,7 @@ fn main(
                 sums = coopMultiplyAdd(v, h, sums);
             }
         }
-        // The result needs a name: naga 30 cannot store unnamed ones.
+        // The product needs a name, because naga 30 cannot store unnamed results.
         let total = sums * (1.0 / gradient_scale(batch.n_rays));
         let stride = layer.n_in;
         let first = 4u * (ix / N_LAYERS * n_weight_words() + layer.first_weight) + output * stride + input;

@@ -1,5 +1,5 @@
-// weights_to_half: converts the weights of all layers to f16 for cooperative matrices, with zeros for padding outputs;
-// followed by the rounding error of each weight in f16.
+// weights_to_half: converts the weights of all layers to f16 for cooperative matrices, with zeros for padding outputs.
+// The f16 rounding errors of all weights follow the weights.
 //
 // threads   one per four weights
 // reads     weights [n_weights / 4]

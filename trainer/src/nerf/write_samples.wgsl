@@ -1,4 +1,4 @@
-// write_samples: the samples of each ray.
+// write_samples: writes the samples of each ray.
 //
 // threads   8 per ray, each for a part of it
 // reads     batch, march, rays, n_found [n_rays], n_before [n_rays, 8], occupied

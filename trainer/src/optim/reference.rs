@@ -10,7 +10,7 @@ pub struct Adam {
     pub beta1: f64,
     /// Decay of the mean squared gradient per step.
     pub beta2: f64,
-    /// Added to the root of the mean square, so that a zero gradient changes nothing.
+    /// Added to the root mean square, so that a zero gradient leaves the parameter unchanged.
     pub epsilon: f64,
 }
 
@@ -81,7 +81,7 @@ mod tests {
         for (ix, &gradient) in gradients.iter().enumerate() {
             let step = u32::try_from(ix + 1).expect("a few steps");
             adam.update(step, 0.01, &mut param, gradient, &mut moments);
-            // The bias-corrected means are weighted means of all gradients so far, newest first.
+            // The bias-corrected means are weighted means of all previous gradients, newest first.
             let mean = |beta: f64, power: i32| {
                 let weight = |age: usize| beta.powi(i32::try_from(age).expect("a few steps"));
                 let sum: f64 =
@@ -96,7 +96,7 @@ mod tests {
 
     #[test]
     fn each_parameter_uses_its_own_rate() {
-        // The first step equals the rate for any size of the gradient; a zero gradient changes nothing.
+        // The first step equals the rate for any gradient magnitude; a zero gradient changes nothing.
         let mut params = [1.0, 2.0, 3.0];
         let mut moments = [Moments::default(); 3];
         Adam::default().update_all(1, &[0.1, 0.02, 0.5], &mut params, &[1e-6, -40.0, 0.0], &mut moments);

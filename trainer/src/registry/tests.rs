@@ -45,7 +45,7 @@ fn untrained_model_of_every_method_is_resumed_saved_and_recognized() {
     }
 }
 
-/// A live run deletes a removed keyframe with the next checkpoint.
+/// A live run deletes removed keyframes when it writes the next checkpoint.
 #[test]
 fn removed_keyframe_is_not_needed_to_resume() {
     let gpu = Gpu::open(&GpuOptions::default()).unwrap();

@@ -5,7 +5,7 @@ struct AdamRule {
     final_rate_frac: f32,  // fraction of the initial rate that remains after the planned steps
     betas: vec2f,          // Adam's betas
     epsilon: f32,          // Adam's epsilon
-    weight_decay: f32,             // decay of weights towards zero, per step and unit of rate
+    weight_decay: f32,             // decay of weights toward zero, per step and unit of rate
     n_planned_steps: f32,
     unused: f32,
 }

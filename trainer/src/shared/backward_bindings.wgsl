@@ -6,7 +6,7 @@
 @group(0) @binding(6) var<storage, read> upstream: array<vec4f>;
 @group(0) @binding(7) var<storage, read> pixel_totals: array<vec2f>;
 @group(0) @binding(8) var<storage, read> last: array<u32>;
-// Each intersection of splat and tile has its own slot, written once; `update` adds a splat's slots in order.
+// Each intersection of splat and tile has its own slot, written once; `update` sums the slots of a splat in order.
 @group(0) @binding(9) var<storage, read_write> gradients: array<f32>; // 12 per slot, see `Gradient`
 
 const N_PARTS_OF_GRADIENT = 12u;
@@ -20,7 +20,7 @@ fn write_gradient(slot: u32, part: u32, value: f32) {
     gradients[slot * N_PARTS_OF_GRADIENT + part] = value;
 }
 
-// A lane's pixels: upstream gradients and compositing state around the current splat.
+// Upstream gradients of a lane's pixels, and their compositing state around the current splat.
 struct Pixels {
     v_red: Px,
     v_green: Px,
@@ -51,10 +51,10 @@ fn pixels_at(tile: Tile, first: vec2u) -> Pixels {
     return out;
 }
 
-// Contribution of a lane's pixels to the gradient of the current splat; moves the splat to the front part of the blend.
+// Contribution of a lane's pixels to the gradient of the current splat. Also composites the splat into the pixels.
 //
-// The color behind a splat is `pixel_totals` minus the color in front of it, so each pixel carries one extra number
-// next to its transmittance.
+// The color behind a splat is `pixel_totals` minus the color up to and including the splat, so each pixel carries only
+// one number in addition to its transmittance.
 fn passed(pixels: ptr<function, Pixels>, hit: PxB, power: Px, dx: Px, dy: f32, splat: ProjectedSplat) -> Gradient {
     let falloff = select(Px(0.0), exp2(-power), hit);
     let unclamped = splat.position.w * falloff;
@@ -78,7 +78,7 @@ fn passed(pixels: ptr<function, Pixels>, hit: PxB, power: Px, dx: Px, dy: f32, s
     );
 }
 
-// Converts the sums of `passed` to the gradient; see `halved`.
+// Converts the sums of `passed` to the gradient with respect to the unscaled conic; see `halved`.
 fn finished(sum: Gradient, half: vec4f) -> Gradient {
     let moved = LN_2 * sum.position.xy;
     return Gradient(

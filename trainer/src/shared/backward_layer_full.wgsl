@@ -1,4 +1,4 @@
-// backward_layer: gradients with respect to the inputs of a layer, from rows of one bank to rows of the other.
+// backward_layer: gradients with respect to a layer's inputs. Reads rows of one bank and writes rows of the other.
 
 fn evaluate_layer(layer: Layer, tile: u32, lane: u32) {
     let part = lane % PARTS;
@@ -16,6 +16,6 @@ fn evaluate_layer(layer: Layer, tile: u32, lane: u32) {
             put_four(BANK - layer.from_bank, 4u * group + i, part, layer_output(layer, tile, 4u * group + i, part, sums[i]));
         }
     }
-    // This layer has read its inputs and written its rows before the next layer reads or overwrites them.
+    // The layer has read its inputs and written its rows before the next layer reads or overwrites them.
     workgroupBarrier();
 }

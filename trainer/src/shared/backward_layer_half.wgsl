@@ -1,6 +1,6 @@
-// backward_layer: gradients with respect to the inputs of a layer, which may be the outputs of the layer below.
+// backward_layer: gradients with respect to a layer's inputs, which may be the outputs of the layer below.
 //
-// Gradients are single f16 numbers: their rounding error is small compared with their variation between steps.
+// Gradients are plain f16 without residuals: their rounding error is small compared with their noise between steps.
 
 fn put_residual(at: u32, i: u32, value: f32) {}
 

@@ -1,11 +1,11 @@
-// bins: squares of 4 x 4 tiles. A splat is listed once per bin, with a mask of the tiles it touches there.
+// bins: squares of 4 x 4 tiles. A splat is listed once per bin, with a mask of the tiles that it touches there.
 //
-// There are few lists with many entries. Sorting splats into bins costs a fraction of sorting them into tiles, and a
-// tile finds its splats in its bin's list by testing one bit per entry. `count_bins` decides once which tiles a splat
-// touches and stores the result as integers.
+// There are few lists with many entries: sorting splats into bins is much cheaper than sorting them into tiles, and a
+// tile finds its splats by testing one bit per entry of its bin's list. `count_bins` determines the tiles of each splat
+// once and stores the result as integers.
 
 const BIN_TILES = 4u;
-const BLOCK = 256u;        // splats per workgroup, neighbors in depth order
+const BLOCK = 256u;        // splats per workgroup, consecutive in depth order
 const WINDOW_BINS = 256u;  // bins that a workgroup processes
 const GROUP = 16u;         // blocks whose counts one workgroup sums
 
@@ -16,7 +16,8 @@ struct Touched {
     second: u32,           // the same, one row of bins below
 }
 
-// Larger splats touch all tiles of a rectangle: `first` and `second` are the first and past-the-last columns and rows.
+// A larger splat touches all tiles of a rectangle: `first` and `second` hold its first and past-the-last column and
+// row.
 const LARGE = 0xffffffffu; // value of `bin`
 
 fn n_bins(n_tiles: vec2u) -> vec2u {

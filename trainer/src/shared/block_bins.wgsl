@@ -1,4 +1,4 @@
-// block_bins: which splats of a block reach which bins, as bits in workgroup memory. Import after `bins`.
+// block_bins: bit masks, in workgroup memory, of the splats of a block that reach each bin. Import after `bins`.
 
 const WORDS = BLOCK / 32u;
 var<workgroup> wg_reaching: array<atomic<u32>, 2048>; // [WINDOW_BINS, WORDS]
@@ -20,7 +20,7 @@ fn block_and_window(group: u32, n_splats: u32, n_tiles: vec2u) -> BlockAndWindow
     return BlockAndWindow(group / n_windows, (n_splats + BLOCK - 1u) / BLOCK, bins, first_bin, n_in_window);
 }
 
-// Sets the bits of every lane's splat. Every lane must call it; the bits may be read when it returns.
+// Sets the bits of all lanes' splats. Every lane must call it. The bits may be read when it returns.
 fn set_reached_bins(lane: u32, at: BlockAndWindow, touched: Touched) {
     for (var i = lane; i < at.n_bins * WORDS; i += BLOCK) { atomicStore(&wg_reaching[i], 0u); }
     workgroupBarrier(); // All bits are zero before the first is set.

@@ -1,13 +1,13 @@
 // camera_params: calibration parameters of cameras, optimized together with the splats.
 //
-// Parameters of a camera (shared by all its images) and of a single image have the same layout: 16 per camera, 16 per
-// image.
+// The 16 parameters of a camera, shared by all its images, and the 16 parameters of a single image have the same
+// layout.
 
-// A parameter is a vec4f: its value, Adam's two moments, and the number of steps it has taken.
+// Each parameter is a vec4f: its value, Adam's two moments, and the number of steps taken.
 
 const ROTATION = 0u;           // rotation vector in the camera's axes, radians
 const TRANSLATION = 3u;          // meters; rotation and translation are applied after camera_from_world
-const TIME_OFFSET = 6u;          // seconds that the poses lag behind the images
+const TIME_OFFSET = 6u;          // seconds by which the poses lag behind the images
 const LOG_FOCAL = 7u;      // two values
 const PRINCIPAL = 9u;      // two values, in focal lengths
 const LOG_GAIN = 11u;      // red, green and blue
@@ -22,7 +22,7 @@ struct Lens {
     unused: vec2u,
 }
 
-// Which parameters are optimized, and at what rate.
+// Parameters that are optimized, and their learning rates.
 struct CameraRule {
     camera_mask: u32,        // bit i: parameter i of a camera
     image_mask: u32,         // likewise for an image
@@ -31,7 +31,7 @@ struct CameraRule {
     time_offset_rate: f32,       // seconds
     focal_rate: f32,
     gain_rate: f32,
-    image_decay: f32,       // fraction by which a step decays an image's parameters towards zero
+    image_decay: f32,       // fraction by which a step decays an image's parameters toward zero
 }
 
 // Rotates `v` by a rotation vector (Rodrigues).

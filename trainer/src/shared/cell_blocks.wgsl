@@ -1,4 +1,4 @@
-// cell_blocks: blocks of occupancy cells, stored behind the cells.
+// cell_blocks: blocks of occupancy cells. Their bits are stored after those of the cells.
 
 const MAX_BLOCKS = 16u; // along an axis
 

@@ -1,6 +1,6 @@
-// coverage: how a splat covers a lane's pixels. Import after `pixels`.
+// coverage: evaluates a splat at a lane's pixels. Import after `pixels`.
 
-// Set or get one pixel's value. Indexing by a variable would spill a lane's values to memory.
+// Set or get one pixel's value. A variable index would spill the lane's values to memory.
 fn put(all: Px, k: u32, value: f32) -> Px {
     return select(all, Px(value), INDEX == PxU(k));
 }
@@ -19,7 +19,7 @@ fn pick_u(all: PxU, k: u32) -> u32 {
 
 const LN_2 = 0.6931471805599453;
 
-// A conic scaled for the pixels: its quadratic form gives the falloff as a power of 2; w: the largest power drawn.
+// Scales a conic so that its quadratic form gives the falloff as a power of 2; w: the largest power drawn.
 fn halved(conic: vec4f) -> vec4f {
     return conic * vec4f(0.5, 1.0, 0.5, 0.5) / LN_2;
 }

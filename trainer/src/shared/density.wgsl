@@ -1,8 +1,8 @@
 // density: converts the output of the first network to density per unit of length.
 
-// Upper limit of the logarithm, so that no density is infinite.
+// Upper limit of the logarithm, to keep densities finite.
 const MAX_LOG_DENSITY = 12.0;
-// Added to the network's output. Keeps an untrained field thin.
+// Added to the network's output. Sets the density of an untrained field.
 const LOG_DENSITY_BIAS = 0.0;
 
 fn density_of(log_density: f32) -> f32 {

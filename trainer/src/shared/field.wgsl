@@ -1,18 +1,18 @@
 // field: a signed distance field in blocks of 8x8x8 voxels, and the packing of a voxel's words.
 //
 // Field coordinates are meters from the anchor, along the world's axes. Voxel i covers [i, i + 1) voxel_m; its center
-// is at i + 0.5. A chunk is 8x8x8 blocks. `keys` is a hash table of chunks with open addressing. Row h of `entries`
-// belongs to the chunk at position h of that table: it holds the slot of each of its blocks plus one, or 0 for missing
-// blocks.
+// is at i + 0.5. A chunk is 8x8x8 blocks. `keys` is a hash table of chunks with open addressing. The chunk at position
+// h of that table owns row h of `entries`: one entry per block, the block's slot plus one, or 0 if the block is
+// missing.
 //
 // source    Niessner et al. 2013 (voxel hashing); Oleynikova et al. 2017 (Voxblox); chunks of blocks are ours: a ray
-//           crosses empty ones in one step, and one word is enough for a key
+//           crosses an empty chunk in one step, and a key fits into one word
 
 struct Field {
     voxel_m: f32,
     truncation_m: f32,        // minimum truncation
     scale_m: f32,             // maximum truncation; also the distance that the largest stored number represents
-    noise_per_m2: f32,        // standard deviation of depth at 1 m; it grows with the square
+    noise_per_m2: f32,        // standard deviation of depth at 1 m; grows with the square of depth
     max_depth_m: f32,
     max_weight: u32,          // in 256ths
     n_chunk_slots: u32,       // a power of two
@@ -49,7 +49,7 @@ fn chunk_in_range(chunk: vec3i) -> bool {
     return all(chunk >= -CHUNK_LIMIT) && all(chunk < CHUNK_LIMIT);
 }
 
-// Never 0, which marks an empty position.
+// Key of a chunk. Never 0, which marks an empty position.
 fn key_of(chunk: vec3i) -> u32 {
     let at = vec3u(chunk + CHUNK_LIMIT + 1);
     return ~((at.x << 21u) | (at.y << 10u) | at.z);

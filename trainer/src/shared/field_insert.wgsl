@@ -1,4 +1,4 @@
-// field_insert: finds the row of a chunk, or inserts it. The row depends on thread timing, but no result depends on the
+// field_insert: finds or inserts the row of a chunk. The row depends on thread timing, but no result depends on the
 // row.
 //
 // needs     field, status and keys as arrays of atomics

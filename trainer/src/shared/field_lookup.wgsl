@@ -1,4 +1,4 @@
-// field_lookup: finds chunks and blocks of a field that does not change meanwhile.
+// field_lookup: finds chunks and blocks of a field that is not modified concurrently.
 //
 // needs     field, keys and entries as plain arrays
 
@@ -16,7 +16,7 @@ fn find_row(chunk: vec3i) -> u32 {
     return 0u;
 }
 
-// The slot plus one of a block in the chunk with this row plus one; 0 if there is no such block.
+// Slot plus one of a block, given the row plus one of its chunk; 0 if there is no such block.
 fn slot_in_row(row: u32, block: vec3i) -> u32 {
     if row == 0u { return 0u; }
     return entries[(row - 1u) * BLOCK_VOXELS + voxel_in_block(block)];

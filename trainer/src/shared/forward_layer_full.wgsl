@@ -1,4 +1,4 @@
-// forward_layer: evaluates one layer, from rows of one bank to rows of the other.
+// forward_layer: evaluates one layer. Reads rows of one bank and writes rows of the other.
 
 fn evaluate_layer(layer: Layer, tile: u32, lane: u32) {
     let part = lane % PARTS;
@@ -16,6 +16,6 @@ fn evaluate_layer(layer: Layer, tile: u32, lane: u32) {
             put_four(BANK - layer.from_bank, 4u * group + j, part, layer_output(layer, tile, 4u * group + j, part, sums[j]));
         }
     }
-    // This layer has read its inputs and written its rows before the next layer reads or overwrites them.
+    // The layer has read its inputs and written its rows before the next layer reads or overwrites them.
     workgroupBarrier();
 }

@@ -1,4 +1,4 @@
-// gradient: gradient of the loss with respect to a projected splat, from one intersection or summed over all.
+// gradient: gradient of the loss with respect to a projected splat, for one intersection or summed over all of them.
 
 struct Gradient {
     position: vec4f,      // mean_px.xy, depth, opacity

@@ -1,14 +1,14 @@
-// hash_grid: the entries of a level that surround a point.
+// hash_grid: the grid entries of a level around a point.
 
 struct Level {
     n_cells: u32,
     begin: u32,             // index of its first entry
-    mask: u32,              // entries minus one, a power of two minus one; 0: one entry per corner
+    mask: u32,              // number of entries, a power of two, minus one; 0: one entry per corner
     unused: u32,
 }
 
 struct Cell {
-    first: vec3u,           // corner nearest to zero
+    first: vec3u,           // corner with the smallest coordinates
     share: vec3f,           // position between the first corner and the opposite one, 0 to 1
 }
 

@@ -1,8 +1,8 @@
 // image_params: parameters optimized per image.
 //
-// The pose: rotation about the origin of its rays, as a rotation vector in world, radians; and translation in world, in
-// units of the scene radius. The appearance embedding: an input of the color network that represents light and
-// exposure. A parameter is its value, Adam's two moments, and the number of steps it has taken.
+// The pose: rotation about the origins of the image's rays, as a rotation vector in world, radians; and translation in
+// world, in units of the scene radius. The appearance embedding: an input of the color network that represents lighting
+// and exposure. Each parameter has its value, Adam's two moments, and the number of steps taken.
 
 const IMAGE_PARAM_STRIDE = 9u;    // parameters per image
 const TRANSLATION = 3u;          // index of the first translation parameter

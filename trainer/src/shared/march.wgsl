@@ -2,22 +2,23 @@
 // `cell_blocks` and `occupied` of the kernel.
 //
 // twin      nerf/reference/march.rs
-// source    occupancy: Mueller et al. 2022, appendix C; steps grow outside the inner cube as contraction shrinks them
+// source    occupancy: Mueller et al. 2022, appendix C; steps outside the inner cube grow to match the contraction
 //
-// Segments are numbered along the ray. A segment's position follows from its number, so several threads can walk one
-// ray.
+// Segments are numbered along the ray. The position of a segment follows from its number, so several threads can share
+// one ray.
 
 const FAR = 1e9;
 
 struct Path {
-    enter: f32,            // where the ray enters the inner cube; `begin` of the ray if it misses the cube
+    enter: f32,            // distance at which the ray enters the inner cube; `begin` of the ray if it misses the cube
     leave: f32,
     n_before: f32,         // steps before the inner cube
     n_inside: f32,
     n_segments: u32,
 }
 
-// Steps taken to get this far from the inner cube, as a fraction of the steps to infinity: steps grow with distance.
+// Fraction of the steps from the inner cube to infinity that are needed to reach a distance from it: steps grow with
+// distance.
 fn share_of(distance: f32) -> f32 { return 1.0 - 1.0 / (1.0 + distance); }
 fn distance_of(share: f32) -> f32 { return 1.0 / (1.0 - share) - 1.0; }
 
@@ -52,9 +53,9 @@ fn bit_of(first_word: u32, n: u32, cell: vec3u) -> bool {
     return (occupied[first_word + ix / 32u] >> (ix % 32u) & 1u) == 1u;
 }
 
-// Number of steps from `at` whose midpoints all lie in the same empty box of the unit cube; the midpoint of the first
-// one does. Returns one if the box reaches out of the inner cube: only inside it do unit cube and world differ by a
-// constant factor, which makes all steps equal.
+// Number of steps from `at` whose midpoints all lie in the same empty box of the unit cube; the first midpoint is in
+// it. Returns one if the box extends beyond the inner cube. Only inside the inner cube do unit cube and world differ by
+// a constant factor, so that all steps are equal.
 fn n_empty_steps(march: March, at: vec3f, direction: vec3f, box: vec3u, n_boxes: u32) -> u32 {
     let size = 4.0 / f32(n_boxes);
     let low = vec3f(box) * size - 2.0;
@@ -65,14 +66,14 @@ fn n_empty_steps(march: March, at: vec3f, direction: vec3f, box: vec3u, n_boxes:
     return u32(clamp(min(ends.x, min(ends.y, ends.z)) / march.step - 0.5, 1.0, 4096.0));
 }
 
-// A segment of a ray in an occupied cell; its `ix` is `end_ix` if there is none before that.
+// A segment of a ray in an occupied cell. If there is none before `end_ix`, `ix` is `end_ix`.
 struct RaySegment {
     ix: u32,
     begin: f32,
     end: f32,
 }
 
-// The first such segment from number `from_ix`.
+// The first such segment, starting the search at number `from_ix`.
 fn next_segment(march: March, ray: Ray, path: Path, from_ix: u32, end_ix: u32) -> RaySegment {
     let block_cells = block_cells_of(march.n_cells);
     let n_blocks = march.n_cells / block_cells;

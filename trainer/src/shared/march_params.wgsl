@@ -2,7 +2,7 @@
 
 struct March {
     step: f32,             // inside the inner cube
-    max_samples: u32,     // per ray if the buffers can hold that many for each, otherwise half as many, and so on
+    max_samples: u32,     // per ray; halved until the samples of all rays fit into the buffers
     n_cells: u32,          // cells of the occupancy grid along an axis
     first_ray: u32,        // index of this batch's first ray within a picture
     max_found: u32,       // maximum number of segments to find per ray
@@ -10,7 +10,7 @@ struct March {
     unused_2: vec2u,
 }
 
-// Selects every `stride`-th of the segments found, from `phase` on; each one represents `stride` segments.
+// Selects every `stride`-th found segment, starting at `phase`. Each selected segment represents `stride` segments.
 struct Thinning {
     stride: u32,
     phase: u32,

@@ -1,4 +1,4 @@
-// march_threads: the part of a ray that one of several threads walks. Import after `march`.
+// march_threads: splits a ray among several threads. Import after `march`.
 
 const THREADS_PER_RAY = 8u;
 

@@ -1,4 +1,4 @@
-// mesh_work: which blocks are meshed, and where their triangles are stored.
+// mesh_work: the blocks to mesh, and the locations of their triangles.
 
 // The part of the block list that one dispatch meshes.
 struct MeshBatch {
@@ -23,5 +23,5 @@ struct MeshVertex {
 }
 
 // Indices into the counters of vertices and triangles.
-const N_VERTICES = 0u;        // of the batch, including those that did not fit
+const N_VERTICES = 0u;        // of the batch, including vertices that did not fit
 const N_TRIANGLES = 1u;

@@ -1,4 +1,4 @@
-// network_layers: the layers of both networks: widths, the tile rows that hold inputs and output gradients, and the
+// network_layers: widths of the layers of both networks, the tile rows of their inputs and output gradients, and the
 // start of their weights. Import after `network_tile`.
 
 const N_LAYERS = 5u;

@@ -4,5 +4,5 @@ alias Four = vec4f;
 
 fn narrowed(v: vec4f) -> Four { return v; }
 
-// Factor on gradients while they are stored in this type, for a step with this many rays.
+// Factor by which gradients are multiplied while stored in this type, for a step with this many rays.
 fn gradient_scale(n_rays: u32) -> f32 { return 1.0; }

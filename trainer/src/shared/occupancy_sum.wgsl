@@ -1,3 +1,3 @@
-// occupancy_sum: unit of the sum of cell occupancies, an integer.
+// occupancy_sum: scale of the integer sum of cell occupancies.
 
-const MAX_SUM = 4294967040.0; // The sum if all cells are opaque; the largest f32 that is a u32.
+const MAX_SUM = 4294967040.0; // The sum if all cells are opaque; the largest f32 that fits into a u32.

@@ -1,13 +1,13 @@
 // param_step: one Adam step for a parameter of a camera or an image.
 //
-// A parameter is a vec4f: its value, Adam's two moments, and the number of steps it has taken.
+// Each parameter is a vec4f: its value, Adam's two moments, and the number of steps taken.
 //
 // twin      optim/reference.rs
 
 const PARAM_BETAS = vec2f(0.9, 0.99);
 const PARAM_EPSILON = 1e-15;
 
-// decay: fraction by which the step decays the value towards zero.
+// decay: fraction by which the step decays the value toward zero.
 fn adam_step(before: vec4f, gradient: f32, rate: f32, decay: f32) -> vec4f {
     let moments = mix(vec2f(gradient, gradient * gradient), before.yz, PARAM_BETAS);
     let n_steps = before.w + 1.0;

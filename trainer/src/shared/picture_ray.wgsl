@@ -13,7 +13,7 @@ fn rotated_to_world(v: vec3f) -> vec3f {
     return view.camera_row_0.xyz * v.x + view.camera_row_1.xyz * v.y + view.camera_row_2.xyz * v.z;
 }
 
-// Part of a range of depths that is inside a box, in the box's frame.
+// Clips a range of depths to the part inside a box, in the box's frame.
 fn within_box(range: vec2f, origin: vec3f, along: vec3f, low: vec3f, high: vec3f) -> vec2f {
     let safe = select(along, vec3f(1e-12), abs(along) < vec3f(1e-12));
     let a = (low - origin) / safe;

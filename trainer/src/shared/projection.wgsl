@@ -1,9 +1,9 @@
-// projection: projects a splat to the image, and keeps the intermediate values its gradient needs.
+// projection: projects a splat to the image. Returns intermediate values that the gradient needs.
 //
 // twin      splat/reference/project.rs
-// source    Zwicker et al. 2001 (EWA volume splatting); Kerbl et al. 2023, section 4; the clamp of x/z and y/z in the
-//           Jacobian and the low-pass of 0.3 pixels squared are those of gsplat (0.3 at full size). The motion of the
-//           camera during the readout, up to the splat's row, moves the point and its Jacobian by the camera's twist.
+// source    Zwicker et al. 2001 (EWA volume splatting); Kerbl et al. 2023, section 4. As in gsplat, x/z and y/z are
+//           clamped in the Jacobian, and the low-pass is 0.3 pixels squared (at full size). The motion of the camera
+//           during the readout, up to the splat's row, moves the point and its Jacobian by the camera's twist.
 
 const MIN_ALPHA = 0.00392156862745098; // 1 / 255
 const MAX_ALPHA = 0.999;
@@ -71,7 +71,7 @@ fn project_splat(view: View, mean: vec3f, rotation_wxyz: vec4f, log_scale: vec3f
     let row_y = out.jacobian_y * out.axes;
     let low_pass_px2 = view.center_in_world.w;
     out.covariance = vec3f(dot(row_x, row_x) + low_pass_px2, dot(row_x, row_y), dot(row_y, row_y) + low_pass_px2);
-    // The determinant without cancellation: the splat's own part is a squared cross product.
+    // Avoids cancellation: without the low-pass, the determinant is a squared cross product.
     let area = cross(row_x, row_y);
     out.determinant = dot(area, area) + low_pass_px2 * (out.covariance.x + out.covariance.z - low_pass_px2);
     return out;

@@ -1,4 +1,4 @@
-// random: hashes of a position and a time, so that threads share no random state.
+// random: hash-based random numbers from a position and a time, so that threads share no state.
 //
 // source    Jarzynski and Olano 2020 (PCG3D)
 
@@ -10,7 +10,7 @@ fn hash3(key: vec3u) -> vec3u {
     return v;
 }
 
-// Three numbers of 0 <= x < 1.
+// Three numbers in 0 <= x < 1.
 fn uniform3(key: vec3u) -> vec3f {
     return vec3f(hash3(key) >> vec3u(8u)) / 16777216.0;
 }

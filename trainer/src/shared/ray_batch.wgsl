@@ -14,12 +14,12 @@ struct Ray {
     n_samples: u32,
     begin: f32,             // start of the visible range along the ray
     end: f32,
-    embedding: u32,              // of the image it belongs to
+    embedding: u32,              // embedding index of the ray's image
     target_rgb: u32,        // rgba8; a = 0: no observation
     target_distance: f32,   // along the ray; 0: unknown
-    jitter: f32,             // offset of its samples, in steps, 0 to 1
-    is_finished: u32,          // 1: a picture's ray that has reached full opacity or its end
-    next_segment: u32,        // for a picture's ray: the first segment not searched yet
+    jitter: f32,             // offset of the samples, in steps, 0 to 1
+    is_finished: u32,          // for a ray of a picture: 1 if it reached full opacity or its end
+    next_segment: u32,        // for a ray of a picture: first segment not searched yet
 }
 
 // Interval of a ray that a sample covers.

@@ -1,12 +1,12 @@
-// rows_and_columns: windows of 11 x 11 pixels for a workgroup of 8 lanes in one subgroup. For adapters whose lanes read
-// memory one after the other: a workgroup reads each value once and shares it between windows by shuffles.
+// rows_and_columns: windows of 11 x 11 pixels for a workgroup of 8 lanes in one subgroup, for adapters whose lanes
+// access memory one after another. The workgroup reads each value once and shares it between windows by shuffles.
 //
-// A lane holds 4 neighboring pixels of a row, and the workgroup moves down the rows. The two lanes at either side only
-// supply the border; the rest covers the width of a tile. Import after `supervision`.
+// A lane holds 4 neighboring pixels of a row, and the workgroup moves down the rows. The two outer lanes on each side
+// only supply the border; the inner lanes cover the width of a tile. Import after `supervision`.
 
 const LANES = 8u;
 const STRIP_TILES = 2u;    // tiles per workgroup, one below the other
-const N_ROWS = STRIP_TILES * TILE_PX + 2u * HALO; // rows that it reads
+const N_ROWS = STRIP_TILES * TILE_PX + 2u * HALO; // rows to read
 
 // The strip that a workgroup processes.
 struct ColorStrip {
@@ -28,7 +28,7 @@ fn color_strip(group: u32, lane: u32, n_tiles: vec2u) -> ColorStrip {
 
 const G = GAUSSIAN;
 
-// Contributions of the rows so far to the windows that end one, two, ... rows further down.
+// Partial sums of the windows that end one, two, ... rows further down.
 struct Windows {
     in_1: vec4f,
     in_2: vec4f,
@@ -42,7 +42,7 @@ struct Windows {
     in_10: vec4f,
 }
 
-// Adds a row to the windows and returns the vertical sums of the window that ends with it.
+// Adds a row to the windows and returns the vertical sums of the window that ends at this row.
 fn add_row(windows: ptr<function, Windows>, row: vec4f) -> vec4f {
     let before = *windows;
     let finished = before.in_1 + G[10] * row;
@@ -61,7 +61,7 @@ fn add_row(windows: ptr<function, Windows>, row: vec4f) -> vec4f {
     return finished;
 }
 
-// Horizontal sums around each of the lane's pixels; the Gaussian is symmetric.
+// Horizontal sums around each of the lane's pixels. The Gaussian is symmetric.
 fn along_row(lane: u32, own: vec4f) -> vec4f {
     let left = subgroupShuffle(own, (lane - 1u) & 7u);
     let right = subgroupShuffle(own, (lane + 1u) & 7u);

@@ -1,7 +1,7 @@
-// rows: inputs and outputs of layers in workgroup memory; the kernel is a function `work`.
+// rows: inputs and outputs of layers in workgroup memory. The kernel defines a function `work`.
 //
-// Rows are in two banks that layers alternately read from and write to. Within a layer, a thread computes four rows of
-// four samples.
+// Layers alternate between two banks of rows: they read from one and write to the other. Within a layer, a thread
+// computes four rows of four samples.
 
 const BANK = 576u;                 // start of the second bank: 64 strides
 

@@ -1,7 +1,7 @@
-// rows: inputs and outputs of layers in workgroup memory; the kernel is a function `work`.
+// rows: inputs and outputs of layers in workgroup memory. The kernel defines a function `work`.
 //
-// Inputs are f16 and outputs f32, with one bank of each. A subgroup computes 16 rows of all samples. The layers decide
-// whether to keep the rounding error of f16 (`put_residual`, `put_residuals`).
+// Inputs are f16 and outputs f32, with one bank of each. A subgroup computes 16 rows of all samples. The import of the
+// layers defines whether the f16 rounding error is kept (`put_residual`, `put_residuals`).
 
 const BANK = 0u;
 const HALF_STRIDE = 10u;           // like STRIDE, in vec4 of f16

@@ -6,7 +6,7 @@ struct Sample {
     density: f32,
     transmitted: f32,         // fraction of incoming light that passes through
     rgb: vec3f,
-    is_clamped: bool,      // whether its density is at the maximum
+    is_clamped: bool,      // whether the density is at the maximum
 }
 
 fn sample_at(ix: u32) -> Sample {

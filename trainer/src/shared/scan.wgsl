@@ -10,9 +10,9 @@ fn exclusive_scan(lane: u32, value: u32, total: ptr<function, u32>) -> u32 {
     for (var stride = 1u; stride < SCAN_LANES; stride *= 2u) {
         var below = 0u;
         if lane >= stride { below = wg_scan[lane - stride]; }
-        workgroupBarrier(); // All lanes have read before any writes.
+        workgroupBarrier(); // All lanes have read before any lane writes.
         wg_scan[lane] += below;
-        workgroupBarrier(); // All lanes have written before any reads.
+        workgroupBarrier(); // All lanes have written before any lane reads.
     }
     *total = wg_scan[SCAN_LANES - 1u];
     let inclusive = wg_scan[lane];

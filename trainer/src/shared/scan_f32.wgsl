@@ -9,9 +9,9 @@ fn inclusive_scan_f32(lane: u32, value: f32) -> f32 {
     for (var stride = 1u; stride < 256u; stride *= 2u) {
         var below = 0.0;
         if lane >= stride { below = wg_scan_f32[lane - stride]; }
-        workgroupBarrier(); // All lanes have read before any writes.
+        workgroupBarrier(); // All lanes have read before any lane writes.
         wg_scan_f32[lane] += below;
-        workgroupBarrier(); // All lanes have written before any reads.
+        workgroupBarrier(); // All lanes have written before any lane reads.
     }
     let inclusive = wg_scan_f32[lane];
     workgroupBarrier(); // The array may be reused after this.

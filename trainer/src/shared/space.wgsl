@@ -1,4 +1,4 @@
-// space: contracts the world, in units of the scene radius around its center, to the unit cube.
+// space: contracts the world to the unit cube. World coordinates are in units of the scene radius around its center.
 
 // twin: nerf/reference/space.rs
 fn contract(at: vec3f) -> vec3f {

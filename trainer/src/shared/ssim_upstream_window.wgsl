@@ -1,4 +1,4 @@
-// ssim_upstream: gradient of the structural similarity with respect to a pixel's color, for a workgroup of a tile.
+// ssim_upstream: gradient of the structural similarity with respect to a pixel's color. A workgroup processes a tile.
 
 var<workgroup> wg_gradients: array<vec4f, 676>;
 var<workgroup> wg_rows: array<vec4f, 416>;

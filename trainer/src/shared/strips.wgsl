@@ -1,8 +1,8 @@
 // strips: a workgroup of 8 lanes in one subgroup processes a tile in strips of two rows, 4 neighboring pixels per lane.
 //
-// For software adapters: their lanes read memory one after the other, while a shuffle is one instruction. Each lane
-// therefore reads one splat of eight, and splats are passed on by shuffles. On these adapters a branch costs both of
-// its sides; only loops end early. Splats that do not reach a strip are therefore left out of the loop.
+// For software adapters, whose lanes read memory one after another, while a shuffle is one instruction. Each lane
+// therefore reads one splat of eight and shares it by shuffles. A branch executes both of its sides, and only loops end
+// early, so splats that do not reach a strip are excluded before the loop.
 
 const LANES = 8u;
 const N_STRIPS = 8u;
@@ -17,7 +17,7 @@ fn strip_px(strip: u32, lane: u32) -> vec2u {
     return vec2u((lane & 3u) * PX, strip * 2u + (lane >> 2u));
 }
 
-// Whether a splat may reach two rows, the first of which has its pixel centers at `top`. Exact except for a margin that
+// Whether a splat may reach two rows; the pixel centers of the first row are at `top`. Exact except for a margin that
 // exceeds the rounding error of c - b b / a.
 fn reaches_strip(position: vec4f, conic: vec4f, top: f32) -> bool {
     let dy = max(max(top - position.y, position.y - (top + 1.0)), 0.0);
@@ -38,9 +38,9 @@ fn max_of_lanes(own: u32) -> u32 {
 }
 
 // Queues the tile's entries in order, starting at word `next`, until the queue might overflow or the list ends. Returns
-// their number (x) and the next word (y).
+// the number of queued entries (x) and the next word (y).
 fn queue_entries(lane: u32, next: u32, tile: Tile) -> vec2u {
-    workgroupBarrier(); // No lane reads the previous queue anymore.
+    workgroupBarrier(); // All lanes have finished reading the previous queue.
     var n = 0u;
     var word = next;
     while word * 32u < tile.end && n + LANES * 32u <= QUEUE {

@@ -1,5 +1,5 @@
-// sums: sums over the 32 lanes of a workgroup through its memory, for adapters without subgroups; the kernel is a
-// function `backward`.
+// sums: sums over the 32 lanes of a workgroup through workgroup memory, for adapters without subgroups. The kernel
+// defines a function `backward`.
 
 var<workgroup> wg_lanes: array<f32, 384>; // [LANES, 12]
 

@@ -1,4 +1,4 @@
-// sums: sums over the 32 lanes of a workgroup by shuffles; the kernel is a function `backward`.
+// sums: sums over the 32 lanes of a workgroup by shuffles. The kernel defines a function `backward`.
 
 override SUBGROUP = 32u;
 var<workgroup> wg_parts: array<f32, 96>; // [LANES / 4, 12], per subgroup if the workgroup has several
@@ -11,7 +11,7 @@ fn main(
     backward(folded(wg, n_wgs), subgroup * SUBGROUP + sub_lane);
 }
 
-// Sum over each group of four neighboring lanes of component 2 (lane % 2) + lane / 2 % 2.
+// Sums component 2 (lane % 2) + lane / 2 % 2 over each group of four neighboring lanes.
 fn sum_of_four(lane: u32, mine: vec4f) -> f32 {
     let odd = (lane & 1u) != 0u;
     let two = select(mine.xy, mine.zw, odd) + subgroupShuffleXor(select(mine.zw, mine.xy, odd), 1u);
@@ -36,7 +36,7 @@ fn write_gradient_sum(lane: u32, slot: u32, mine: Gradient) {
         workgroupBarrier(); // All subgroups have written their sums.
         value = 0.0;
         for (var subgroup = 0u; subgroup < LANES / SUBGROUP; subgroup++) { value += wg_parts[subgroup * N_PARTS_OF_GRADIENT + min(part, 11u)]; }
-        workgroupBarrier(); // All lanes have read before the next splat's sums are written.
+        workgroupBarrier(); // All lanes have read the sums before those of the next splat are written.
     }
     if lane < N_PARTS_OF_GRADIENT { write_gradient(slot, part, value); }
 }

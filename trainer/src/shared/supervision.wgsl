@@ -6,8 +6,8 @@ struct Supervision {
     background_srgb: vec4f,   // behind everything; w unused
     dssim_frac: f32,          // weight of D-SSIM in the color loss, 0 to 1
     depth_weight: f32,        // per meter
-    depth_clip_m: f32,        // past which a reading is ignored
-    random_background: f32,   // maximum of a background that changes per step, so that bare areas add loss; 0: off
+    depth_clip_m: f32,        // larger depth residuals have no gradient
+    random_background: f32,   // maximum of a random background per step, which penalizes uncovered areas; 0: off
 }
 
 const WINDOW = 11u;

@@ -1,4 +1,4 @@
-// tile: position of a tile, its bin's list, and the bindings shared by all kernels that run per tile.
+// tile: the position of a tile, the list of its bin, and bindings shared by all kernels that run per tile.
 
 #import view
 #import model
@@ -16,7 +16,7 @@
 struct Tile {
     in_grid: bool,
     corner: vec2u,     // pixels
-    in_bin: u32,       // its bit in the entries' masks and its plane of tile_bits
+    in_bin: u32,       // the tile's bit in the entries' masks and its plane of tile_bits
     begin: u32,        // of the bin's list
     end: u32,
 }
@@ -35,7 +35,7 @@ fn tile_at(tile: u32) -> Tile {
     return out;
 }
 
-// Which of the entries 32 word to 32 word + 31 the tile must process.
+// Mask of the entries 32 word to 32 word + 31 that the tile must process.
 fn entries_of(tile: Tile, word: u32) -> u32 {
     if word * 32u >= tile.end { return 0u; }
     var bits = tile_bits[arrayLength(&tile_bits) / 16u * tile.in_bin + word];

@@ -1,7 +1,7 @@
-// tile_queue: the splats of a tile, 32 at a time, for a workgroup of 32 lanes. For kernels that bind the bins' lists.
+// tile_queue: the splats of a tile, 32 at a time, for a workgroup of 32 lanes in kernels that bind the bins' lists.
 //
-// A lane has two neighboring pixels in each 8 x 8 quarter of the tile, so that a splat is evaluated only in the
-// quarters it touches. Workgroups are small and use little memory: more of them run at once and hide latency.
+// Each lane has two neighboring pixels in each 8 x 8 quarter of the tile, so a splat is evaluated only in the quarters
+// that it touches. Workgroups are small and use little memory, so that more of them run at once and hide latency.
 
 #import tiles
 
@@ -11,7 +11,7 @@ const WORDS = 8u;          // of 32 entries, searched at once
 var<workgroup> wg_words: array<u32, WORDS>;
 var<workgroup> wg_queue: array<u32, 256>;
 var<workgroup> wg_splats: array<ProjectedSplat, BATCH>;  // conic: `halved`; color.w: bits of the rank in the bin's list
-var<workgroup> wg_quarters: array<u32, BATCH>; // that the splat may touch, see `quarters_touched`
+var<workgroup> wg_quarters: array<u32, BATCH>; // quarters that the splat may touch, see `quarters_touched`
 
 // Position within a quarter of the lane's first pixel.
 fn lane_px(lane: u32) -> vec2u {
@@ -21,7 +21,7 @@ fn lane_px(lane: u32) -> vec2u {
 // Queues the tile's entries from the next `WORDS` words in order and returns their number. Every lane must call it.
 fn queue_words(lane: u32, first: u32, tile: Tile) -> u32 {
     if lane < WORDS { wg_words[lane] = entries_of(tile, first + lane); }
-    workgroupBarrier(); // The words are written, and no lane reads the previous queue anymore.
+    workgroupBarrier(); // The words are written, and all lanes have finished reading the previous queue.
     // Four lanes per word.
     let mine = lane / 4u;
     let shift = lane % 4u * 8u;
@@ -44,7 +44,7 @@ fn queue_words(lane: u32, first: u32, tile: Tile) -> u32 {
 
 // Takes a batch from the queue, one splat per lane. Every lane must call it.
 fn take_batch(lane: u32, batch: u32, n_queued: u32, tile: Tile) {
-    workgroupBarrier(); // No lane reads the previous batch anymore.
+    workgroupBarrier(); // All lanes have finished reading the previous batch.
     if batch + lane < n_queued {
         let entry = wg_queue[batch + lane];
         var splat = projected_splats[entries[entry].x];

@@ -1,14 +1,14 @@
-// tiles: which tiles of 16 x 16 pixels an ellipse can touch, exactly, row by row.
+// tiles: the tiles of 16 x 16 pixels that an ellipse can touch, determined exactly, row by row.
 //
-// source    the extent of an ellipse within a band, as in Speedy-Splat (Hanson et al. 2024, AccuTile); widened by a
-//           hundredth of a pixel so that rounding never loses a pixel.
+// source    extent of an ellipse within a band, as in Speedy-Splat (Hanson et al. 2024, AccuTile); widened by a
+//           hundredth of a pixel so that rounding never excludes a pixel.
 
 #import bins
 
 struct Ellipse {
     mean_px: vec2f,
     conic: vec3f,       // A, B, C of A dx^2 + 2 B dx dy + C dy^2
-    reach: f32,         // the ellipse is the set where that is <= reach = 2 ln(255 opacity)
+    reach: f32,         // the form is at most this inside the ellipse: 2 ln(255 opacity)
 }
 
 const TILE_MARGIN_PX = 0.01;
@@ -54,7 +54,7 @@ fn tile_columns(ellipse: Ellipse, row: i32, n_tiles: vec2u) -> vec2i {
     return vec2i(begin, select(begin, end, last >= first));
 }
 
-// Bit 2 row + column for each quarter of the tile, 8 x 8 pixels, that the ellipse may touch.
+// Bit 2 row + column for each 8 x 8 quarter of the tile that the ellipse may touch.
 fn quarters_touched(ellipse: Ellipse, corner_px: vec2f) -> u32 {
     let half_height = sqrt(max(ellipse.reach * ellipse.conic.x / determinant_of(ellipse), 0.0)) + TILE_MARGIN_PX;
     var quarters = 0u;

@@ -27,7 +27,7 @@ fn camera_from_world(view: View, point_in_world: vec3f) -> vec3f {
     return vec3f(dot(view.camera_row_0, point), dot(view.camera_row_1, point), dot(view.camera_row_2, point));
 }
 
-// Whether a point is inside the crop box. True if there is none.
+// Whether a point is inside the crop box. True if there is no crop box.
 fn inside_crop(view: View, point_in_world: vec3f) -> bool {
     if view.crop_min.w == 0.0 { return true; }
     let point = vec4f(point_in_world, 1.0);

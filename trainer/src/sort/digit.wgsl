@@ -1,6 +1,6 @@
 // digit: the eight bits of the key that a pass sorts by. For kernels that bind digit and status.
 //
-// Keys are reduced to 16 bits: their offset from the smallest key, relative to the range, as precisely as 16 bits allow.
+// Keys are reduced to 16 bits: the offset from the smallest key is shifted right until the range of keys fits.
 
 struct Digit {
     shift: u32,
@@ -9,7 +9,7 @@ struct Digit {
     max_blocks: u32,    // capacity of the counts, in blocks
 }
 
-const LAST_KEY = 0xffffffffu; // Sorted after all other keys, and not part of their range.
+const LAST_KEY = 0xffffffffu; // Sorted after all other keys, and excluded from the range.
 
 struct KeyRange {
     min_key: u32,

@@ -1,8 +1,8 @@
-//! Stable radix sort of 32-bit keys on the GPU, in two passes of eight bits: keys are reduced to 16 bits between the
-//! smallest and the largest key. Returns the original indices of the sorted keys.
+//! Stable radix sort of 32-bit keys on the GPU in two passes of eight bits. Keys are first reduced to 16 bits, relative
+//! to the smallest and the largest key. Returns the original indices of the sorted keys.
 //!
-//! There are two variants with the same result: `parallel` ranks keys by subgroup ballots, `sequential` assigns one
-//! block of keys to each thread.
+//! Two variants give the same result: `parallel` ranks keys by subgroup ballots, `sequential` assigns one block of keys
+//! to each thread.
 
 use crate::Error;
 use crate::gpu::{Buffer, Gpu, Kernel, Passes, Pipeline, Source};
@@ -61,7 +61,7 @@ pub struct RadixSort {
     scatter_indices: Pipeline,
 }
 
-/// Buffers of one sort: keys and values twice, and the digits' counts.
+/// Buffers of one sort: two buffers each for keys and values, and the digit counts.
 #[derive(Debug)]
 pub struct SortBuffers {
     /// Keys; sorting alternates between the two buffers.
@@ -103,7 +103,7 @@ impl RadixSort {
 
     /// Allocates buffers for up to `n_max` keys. When sorting, `status[counter]` must hold the number of keys,
     /// `status[largest]` the largest key, and the next word the smallest key, inverted. Keys with all bits set are
-    /// ignored in both and sorted last.
+    /// excluded from this range and sorted last.
     pub fn buffers(
         &self,
         gpu: &Gpu,

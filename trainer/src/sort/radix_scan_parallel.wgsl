@@ -1,4 +1,4 @@
-// radix_scan_parallel: for each digit, count the keys in earlier blocks and the total.
+// radix_scan_parallel: for each digit, compute the number of keys in earlier blocks and in all blocks.
 //
 // threads   one workgroup of 256 per digit
 // reads     digit, status

@@ -19,7 +19,7 @@
 @group(0) @binding(6) var<storage, read_write> keys_out: array<u32>;
 @group(0) @binding(7) var<storage, read_write> values_out: array<u32>;
 
-override VALUES_ARE_INDICES: bool = false; // The first pass of sorting 0, 1, 2, ... by key.
+override VALUES_ARE_INDICES: bool = false; // Set in the first pass, whose values are 0, 1, 2, ...
 const ROUNDS = 8u;
 var<workgroup> wg_ranks: array<atomic<u32>, 4096>; // [subgroup, digit]; subgroups have 16 lanes or more
 
@@ -46,7 +46,7 @@ fn main(
         let peers = peers_of(key_digit, valid);
         let leader = lowest_lane(peers);
         var base = 0u;
-        // The next round's leader waits for this sum through the shuffle, so the rounds count in order.
+        // The shuffle makes the next round's leader wait for this sum, so the rounds count in order.
         if valid && sub_lane == leader { base = atomicAdd(&wg_ranks[subgroup * 256u + key_digit], n_bits(peers)); }
         base = subgroupShuffle(base, select(sub_lane, leader, valid));
         ranks[round] = base + n_bits(peers & lanes_below(sub_lane));

@@ -15,7 +15,7 @@
 @group(0) @binding(5) var<storage, read_write> keys_out: array<u32>;
 @group(0) @binding(6) var<storage, read_write> values_out: array<u32>;
 
-override VALUES_ARE_INDICES: bool = false; // The first pass of sorting 0, 1, 2, ... by key.
+override VALUES_ARE_INDICES: bool = false; // Set in the first pass, whose values are 0, 1, 2, ...
 override WG_SIZE = 8u;
 @compute @workgroup_size(WG_SIZE)
 fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {

@@ -21,7 +21,7 @@ use std::sync::Arc;
 const COLOR_ABS: f64 = 2e-5;
 /// Gradients are f32 sums over hundreds of pixels.
 const GRADIENT_REL: f64 = 2e-3;
-/// This close to a threshold, f32 and f64 may decide differently.
+/// Within this relative distance of a threshold, f32 and f64 may decide differently.
 const MARGIN: f64 = 1e-4;
 
 pub(super) struct KernelFixture {
@@ -110,7 +110,7 @@ impl KernelFixture {
     }
 }
 
-/// Options for both variants: with the adapter's optional features, and without any.
+/// Options for both kernel variants: with and without the adapter's optional features.
 fn adapter_options() -> [GpuOptions; 2] {
     [GpuOptions::default(), GpuOptions { optional_features: false, ..GpuOptions::default() }]
 }
@@ -165,7 +165,7 @@ fn pictures_match_the_twin() {
 
 pub(super) fn target_of(image: &RenderedImage, size_px: [u32; 2]) -> loss_reference::Target {
     let n = image.rgb.len();
-    // Far from the picture everywhere, so that rounding does not change the sign of any absolute difference.
+    // The target differs so much from the picture that rounding cannot change the sign of any absolute difference.
     let byte = |value: f64| ((value + 0.25).rem_euclid(1.0) * 255.0).round() / 255.0;
     loss_reference::Target {
         size_px: size_px.map(|size| size as usize),
@@ -369,8 +369,7 @@ fn moving_keyframe() -> Keyframe {
     }
 }
 
-/// Checks the gradients of the pose against the twin, and those of the lens against central differences of the twin's
-/// picture.
+/// Checks pose gradients against the twin, and lens gradients against central differences of the twin's picture.
 fn check_camera_gradients(
     got: &[f64],
     view: &View,
@@ -428,8 +427,8 @@ fn check_camera_gradients(
     mismatches.assert_none();
 }
 
-/// A stack of opaque splats saturates its tile long before the end of the list. The splats behind get no gradient, in
-/// particular none left over from an earlier step in their slots.
+/// The first few splats in a stack of opaque splats saturate every tile. The splats behind them must get no gradient,
+/// even if their slots contain gradients of an earlier step.
 #[test]
 fn hidden_splats_have_no_gradient() {
     const N_VISIBLE: usize = 8;
@@ -492,8 +491,8 @@ fn invalid_splats_are_not_drawn() {
     assert!(image.as_flattened().iter().chain(&depth).all(|value| value.is_finite()));
 }
 
-/// Camera parameters of zero change nothing. Adam's first step has the length of the learning rate, for the enabled
-/// parameters only.
+/// Camera parameters of zero do not change the view. Adam's first step changes each enabled parameter by its learning
+/// rate, and no other parameter.
 #[test]
 fn camera_params_start_at_zero_and_step_by_their_rate() {
     let view = scene::tilted_view();

@@ -41,7 +41,7 @@ fn wrong_extrinsics_are_corrected_and_resuming_is_exact() {
     let miscalibration = Miscalibration { extrinsics: wrong_extrinsics(), ..Miscalibration::none() };
     let keyframes = capture(&miscalibration);
     let mut uninterrupted = new_model(&gpu, &keyframes);
-    // The step at which the result is applied is step 0 of the new model.
+    // When the alignment is applied, training restarts at step 0.
     train_to(&mut uninterrupted, ALIGNMENT_STEP);
     assert!(uninterrupted.alignment().is_none());
     uninterrupted.step(1).unwrap();
@@ -53,7 +53,7 @@ fn wrong_extrinsics_are_corrected_and_resuming_is_exact() {
     assert_eq!(uninterrupted.calibrated_camera(test).unwrap(), correction.apply(test));
     train_to(&mut uninterrupted, 10);
 
-    // Interrupted before and after the result is applied. The keyframes are stored in another order than they arrived.
+    // Interrupt training before and after the alignment is applied. Stored keyframes are not in the order of arrival.
     let mut stored = keyframes.clone();
     stored.reverse();
     let mut interrupted: Box<dyn Method> = Box::new(new_model(&gpu, &keyframes));
@@ -75,7 +75,7 @@ fn wrong_extrinsics_are_corrected_and_resuming_is_exact() {
     assert!(one.arrays == other.arrays, "arrays differ");
     assert_eq!(uninterrupted.n_total_steps().unwrap(), ALIGNMENT_STEP + 10);
 
-    // The saved model contains the correction, too.
+    // The saved model must also contain the correction.
     let folder = tempfile::tempdir().unwrap();
     uninterrupted.save(folder.path()).unwrap();
     let arrays = ply::read(&folder.path().join("splats.ply")).unwrap();

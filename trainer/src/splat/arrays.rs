@@ -1,4 +1,4 @@
-//! Splats as plain arrays, in the layout of files.
+//! Splats as plain arrays, in the layout of splat files.
 
 use crate::Error;
 
@@ -12,13 +12,13 @@ pub struct SplatArrays {
     pub means: Vec<[f32; 3]>,
     /// Logarithms of the standard deviations along the splat's own axes, meters.
     pub log_scales: Vec<[f32; 3]>,
-    /// Rotations of the splats' axes, w first; any nonzero length.
+    /// Rotations of the splats' axes as quaternions of any nonzero length, w first.
     pub rotations_wxyz: Vec<[f32; 4]>,
     /// Opacities before the logistic function.
     pub opacity_logits: Vec<f32>,
-    /// Color coefficients in the order red, green, blue; those of one splat are contiguous, the constant one first.
+    /// Spherical-harmonic coefficients of red, green and blue. Each splat has a contiguous range, constant term first.
     pub sh: Vec<[f32; 3]>,
-    /// Degree of the color coefficients, 0 to 3.
+    /// Degree of the spherical harmonics, 0 to 3.
     pub sh_degree: u32,
 }
 
@@ -45,7 +45,7 @@ impl SplatArrays {
     /// ```
     pub fn checked(self) -> Result<Self, Error> {
         if self.n_coefficients() > MAX_COEFFICIENTS {
-            return Err(Error::SplatArrays(format!("color degree {}, at most 3", self.sh_degree)));
+            return Err(Error::SplatArrays(format!("SH degree {}, expected at most 3", self.sh_degree)));
         }
         self.check_lengths()?;
         self.check_finite()?;
@@ -115,7 +115,7 @@ mod tests {
         }
     }
 
-    /// Error message of the check after `change` to two valid splats.
+    /// Applies `change` to two valid splats and returns the error message of [`SplatArrays::checked`].
     fn error_after(change: impl FnOnce(&mut SplatArrays)) -> String {
         let mut splats = two_splats();
         change(&mut splats);
@@ -129,10 +129,10 @@ mod tests {
     }
 
     #[test]
-    fn each_invalid_array_is_named() {
+    fn error_names_the_invalid_array() {
         assert_eq!(error_after(|s| s.log_scales.truncate(1)), "splats: 1 log scales for 2 means, expected 2");
         assert_eq!(error_after(|s| s.sh.truncate(5)), "splats: 5 color coefficients for 2 means, expected 8");
-        assert_eq!(error_after(|s| s.sh_degree = 4), "splats: color degree 4, at most 3");
+        assert_eq!(error_after(|s| s.sh_degree = 4), "splats: SH degree 4, expected at most 3");
         assert_eq!(error_after(|s| s.means[1][2] = f32::NAN), "splats: mean of splat 1 is not finite");
         assert_eq!(error_after(|s| s.sh[4][0] = f32::INFINITY), "splats: color of splat 1 is not finite");
         assert_eq!(error_after(|s| s.rotations_wxyz[0] = [0.0; 4]), "splats: rotation of splat 0 has length zero");

@@ -8,9 +8,9 @@
 // twin      splat/reference/rasterize.rs
 // source    Kerbl et al. 2023, appendix A
 //
-// Splats are processed front to back, in the order in which they were blended. Lanes keep the state of their pixels,
-// so only `last` is stored between the two kernels. A splat's contributions from all pixels are summed in a fixed
-// order (`sums`).
+// Splats are processed front to back, in the same order as in `rasterize`. Lanes recompute the state of their pixels,
+// so `rasterize` only needs to store `last`. The contributions of all pixels to a splat are summed in a fixed order
+// (`sums`).
 
 #import backward_bindings
 #import pixels
@@ -47,7 +47,7 @@ fn backward(tile_ix: u32, lane: u32) {
     let first = tile.corner + lane_px(lane);
     let center_x = f32(first.x) + 0.5 + RAMP;
     let center_y = f32(first.y) + 0.5;
-    // Four named variables instead of an array, because arrays indexed by a variable live in memory.
+    // Four named variables instead of an array, because arrays with variable indices are stored in memory.
     var a = pixels_at(tile, first);
     var b = pixels_at(tile, first + vec2u(8u, 0u));
     var c = pixels_at(tile, first + vec2u(0u, 8u));
@@ -59,12 +59,12 @@ fn backward(tile_ix: u32, lane: u32) {
     for (var word = tile.begin / 32u; word * 32u < tile.end; word += WORDS) {
         let n_queued = queue_words(lane, word, tile);
         for (var batch = 0u; batch < n_queued; batch += BATCH) {
-            workgroupBarrier(); // No lane reads the previous batch's slots any more.
+            workgroupBarrier(); // No lane reads the slots of the previous batch anymore.
             if batch + lane < n_queued { wg_slots[lane] = slot_of(wg_queue[batch + lane], tile); }
             take_batch(lane, batch, n_queued, tile);
             let n = min(n_queued - batch, BATCH);
             if bitcast<u32>(wg_splats[0].color.w) >= past_last {
-                // All splats of the batch are hidden in this tile: they have no gradient, but their slots are read.
+                // All splats of the batch are hidden in this tile. Write zeros, because `update` reads their slots.
                 for (var at = lane; at < n * N_PARTS_OF_GRADIENT; at += LANES) {
                     write_gradient(wg_slots[at / N_PARTS_OF_GRADIENT], at % N_PARTS_OF_GRADIENT, 0.0);
                 }

@@ -1,4 +1,4 @@
-// backward_strips: `backward` for adapters whose lanes access memory one after another.
+// backward_strips: `backward` for software adapters, whose lanes access memory sequentially.
 //
 // threads   a workgroup of 8 per tile (see `strips`); each lane owns four of the 32 splats of a batch
 // reads     same as `backward`
@@ -6,22 +6,22 @@
 // twin      splat/reference/rasterize.rs
 // source    same as `backward`
 //
-// Strips are processed one after another. The state of a strip's pixels stays in their lanes while 32 splats are
-// processed in order. Shuffles sum each splat's gradient over the strip's pixels, and the owning lane keeps the sum.
+// Strips are processed one after another. Lanes hold the state of a strip's pixels while 32 splats are processed in
+// order. Shuffles sum each splat's gradient over the strip's pixels, and the lane that owns the splat adds up the sums.
 
 #import backward_bindings
 #import strips
 #import coverage
 
 const BATCH = 32u;
-// State of a strip's pixels between two batches.
+// State of a lane's pixels of one strip between two batches.
 struct StripState {
     transmittance: Px,
     behind: Px,
 }
 var<workgroup> wg_strip_states: array<StripState, 64>; // [N_STRIPS, LANES]
 
-// Eight of the batch's splats, one per lane, and the sums of their gradients so far.
+// One splat per lane, and the sum of its gradients so far.
 struct Owned {
     entry: u32,        // past the end of the list if the lane owns no splat
     splat: ProjectedSplat,
@@ -64,7 +64,7 @@ fn pass_strip(lane: u32, owned: ptr<function, Owned>, strip: Strip, pixels: ptr<
     let reaches = rank < strip.past_last && splat.conic.w >= 0.0 && reaches_strip(splat.position, splat.conic, strip.top);
     var reaching = or_of_lanes(select(0u, 1u << lane, reaches));
     loop {
-        let some = reaching != 0u; // The loop body runs at least once.
+        let some = reaching != 0u; // The loop body runs even if no splat reaches the strip.
         let i = firstTrailingBit(reaching) & 7u;
         reaching &= reaching - 1u;
         let passing = ProjectedSplat(subgroupShuffle(splat.position, i), subgroupShuffle((*owned).half, i), subgroupShuffle(splat.color, i));
@@ -109,13 +109,12 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
         let queued = queue_entries(lane, next, tile);
         next = queued.y;
         for (var batch = 0u; batch < queued.x; batch += BATCH) {
-            // Four named variables instead of an array, so that the compiler keeps them out of memory, which lanes
-            // access one after another.
+            // Four named variables instead of an array, because arrays are stored in memory, which is slow here.
             var a = owned_splat(batch + lane, queued.x);
             var b = owned_splat(batch + lane + LANES, queued.x);
             var c = owned_splat(batch + lane + 2u * LANES, queued.x);
             var d = owned_splat(batch + lane + 3u * LANES, queued.x);
-            let reached = wg_queue[batch] - tile.begin < past_last; // Otherwise the batch is hidden and its gradients are zero.
+            let reached = wg_queue[batch] - tile.begin < past_last; // Otherwise, the batch is hidden: its gradients are zero.
             for (var strip_ix = 0u; strip_ix < N_STRIPS && reached; strip_ix++) {
                 let first = tile.corner + strip_px(strip_ix, lane);
                 var pixels = pixels_at(tile, first);

@@ -1,7 +1,7 @@
 //! Times rendering and training steps on a given cloud, in total and pass by pass.
 //!
 //! The setup matches the benchmark of the peer implementation: a pinhole camera at [`Eye::Outside`] looking along z
-//! with a focal length of 0.9 image widths, a target of uniform noise, L1 loss, every splat updated in every step.
+//! with a focal length of 0.9 image widths, a target of uniform noise, L1 loss, and an update of every splat per step.
 
 use super::arrays::SplatArrays;
 use super::buffers::{ImageBuffers, Scratch, ScratchSize, SplatBuffers, n_bins, n_tiles};
@@ -16,7 +16,7 @@ use serde::Serialize;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-/// Learning rate of every parameter: small, so that the cloud hardly changes.
+/// Learning rate of every parameter. It is small, so that the cloud hardly changes.
 const RATE: f32 = 1e-5;
 
 /// Results for one image size and cloud.
@@ -24,7 +24,7 @@ const RATE: f32 = 1e-5;
 pub struct KernelFigures {
     /// Intersections of splats with tiles.
     pub n_intersections: u64,
-    /// Median GPU time of a picture from the first pass to the last, milliseconds; wall time if timestamps are
+    /// Median GPU time of a picture, from the first pass to the last, milliseconds. Wall time if timestamps are
     /// unavailable.
     pub render_millis: f64,
     /// Median GPU time of a step that updates every splat, milliseconds.
@@ -49,9 +49,9 @@ pub struct KernelFigures {
 /// Position of the camera on the z axis, meters.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Eye {
-    /// -3.2, as in the peer's benchmark: the whole cloud is visible.
+    /// -3.2, as in the peer's benchmark. The whole cloud is visible.
     Outside,
-    /// 0: inside the cloud, as in a room; a part of the cloud is visible.
+    /// 0, inside the cloud, as in a room. Part of the cloud is visible.
     Inside,
 }
 
@@ -69,7 +69,7 @@ impl Eye {
 pub struct Repeats {
     /// Minimum number of warm-up runs.
     pub n_warm_up: usize,
-    /// Minimum duration of the warm-up, unless it takes more than 100 times `n_warm_up` runs.
+    /// Minimum duration of the warm-up. It ends earlier after 100 times `n_warm_up` runs.
     pub warm_up: Duration,
     /// Runs timed with timestamps.
     pub n_timed: usize,
@@ -176,7 +176,7 @@ impl KernelBench {
         })
     }
 
-    /// Measures how large the intersection buffers must be, and allocates them.
+    /// Measures the required size of the intersection buffers and allocates them.
     fn size_buffers(&mut self) -> Result<(), Error> {
         for _ in 0..2 {
             let mut passes = Passes::default();
@@ -257,7 +257,7 @@ impl KernelBench {
     }
 
     fn time(&self, passes: &mut Passes, repeats: Repeats, record: fn(&Self, &mut Passes)) -> Result<(f64, f64), Error> {
-        // Some GPUs stay busy for tenths of a second after large buffers were freed.
+        // Warm up, because some GPUs stay busy for tenths of a second after large buffers are freed.
         let warming = Instant::now();
         let mut n_warm = 0;
         while n_warm < repeats.n_warm_up || (warming.elapsed() < repeats.warm_up && n_warm < 100 * repeats.n_warm_up) {

@@ -1,9 +1,9 @@
-//! Bounds of most of a cloud of splats.
+//! Bounds of a cloud of splats, without outliers.
 
 use super::arrays::SplatArrays;
 use crate::Bounds;
 
-/// If a smaller fraction of the splats is opaque, all splats count.
+/// Minimum fraction of opaque splats. Below it, the bounds are computed from all splats.
 const MIN_OPAQUE_FRAC: f64 = 0.02;
 
 /// Bounds around the median of the splats that are at least half opaque; `None` without splats.
@@ -19,7 +19,7 @@ mod tests {
     use super::*;
     use crate::bounds::MIN_RADIUS_M;
 
-    /// A cloud of splats, given by position and opacity logit.
+    /// Creates splats with these positions and opacity logits.
     fn splats(points: &[([f32; 3], f32)]) -> SplatArrays {
         SplatArrays {
             means: points.iter().map(|(mean, _)| *mean).collect(),
@@ -34,7 +34,7 @@ mod tests {
     #[test]
     fn outliers_and_transparent_splats_do_not_affect_bounds() {
         let mut points: Vec<([f32; 3], f32)> = Vec::new();
-        // A disk, evenly filled along a spiral of golden angles.
+        // A disk filled evenly along a golden-angle spiral.
         for ix in 0u8..100 {
             let (radius, angle) = ((f32::from(ix) / 100.0).sqrt(), f32::from(ix) * 2.399_963);
             points.push(([2.0 + radius * angle.cos(), radius * angle.sin(), 1.0], 3.0));

@@ -7,16 +7,17 @@ use crate::Error;
 use crate::gpu::{Buffer, Gpu, Passes};
 use crate::sort::SortBuffers;
 
-/// Splats per block, consecutive in depth. This and the next two constants equal those in shared/bins.wgsl: bins per
-/// workgroup, and blocks per group.
+/// Splats per block, consecutive in depth. This constant and the next two equal those in shared/bins.wgsl.
 pub(crate) const BLOCK: u32 = 256;
+/// Bins per workgroup.
 pub(crate) const WINDOW_BINS: u32 = 256;
+/// Blocks per group.
 pub(crate) const GROUP: u32 = 16;
 
 /// Number of buffers with one entry per splat.
 pub(crate) const N_PLANAR_BUFFERS: usize = 9;
 
-/// Number of floats of the spherical harmonics past the constant one.
+/// Number of floats per splat for the SH coefficients after the constant term.
 pub(crate) fn n_sh_rest(sh_degree: u32) -> u32 {
     3 * ((sh_degree + 1) * (sh_degree + 1) - 1)
 }
@@ -96,7 +97,7 @@ impl SplatBuffers {
         self.write_model(gpu);
     }
 
-    /// Sets the active degree of spherical harmonics, at most `sh_degree`, for which memory is allocated.
+    /// Sets the active SH degree. It is limited to `sh_degree`, for which memory is allocated.
     pub(crate) fn set_active_degree(&mut self, gpu: &Gpu, degree: u32) {
         if self.active_degree != degree.min(self.sh_degree) {
             self.active_degree = degree.min(self.sh_degree);
@@ -104,7 +105,7 @@ impl SplatBuffers {
         }
     }
 
-    /// The degree of spherical harmonics in use.
+    /// The SH degree in use.
     pub(crate) fn active_degree(&self) -> u32 {
         self.active_degree
     }
@@ -115,8 +116,8 @@ impl SplatBuffers {
         gpu.write(&self.model, 0, bytemuck::bytes_of(&model));
     }
 
-    /// Appends splats, for which there must be capacity. Coefficients past this model's degree are dropped; missing
-    /// ones become zero.
+    /// Appends splats; the caller must reserve capacity. Drops coefficients above this model's degree, and sets missing
+    /// coefficients to zero.
     pub(crate) fn append(&mut self, gpu: &Gpu, arrays: &SplatArrays) {
         let first = u64::from(self.n_splats);
         let n_new = arrays.means.len();
@@ -188,7 +189,7 @@ impl SplatBuffers {
         })
     }
 
-    /// The parameters, with the names under which kernels bind them.
+    /// The parameters, with their binding names in the kernels.
     pub(crate) fn parameters(&self) -> [(&'static str, &Buffer); 5] {
         [
             ("means", &self.means),
@@ -199,7 +200,7 @@ impl SplatBuffers {
         ]
     }
 
-    /// The optimizer's moments, with the names under which kernels bind them.
+    /// The optimizer's moments, with their binding names in the kernels.
     pub(crate) fn all_moments(&self) -> [(&'static str, &Buffer); 3] {
         [("moments", &self.moments), ("sh_dc_moments", &self.sh_dc_moments), ("sh_rest_moments", &self.sh_rest_moments)]
     }
@@ -221,7 +222,7 @@ impl SplatBuffers {
     }
 }
 
-/// Buffers that one view of the model needs while it is drawn and trained on.
+/// Temporary buffers for drawing one view and training on it.
 #[derive(Debug)]
 pub(crate) struct Scratch {
     pub(crate) n_entries: u32,
@@ -247,9 +248,9 @@ pub(crate) struct Scratch {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct ScratchSize {
     pub(crate) n_splats: u32,
-    /// Entries of the bins' lists.
+    /// Entries in the bin lists.
     pub(crate) n_entries: u32,
-    /// Intersections of splats with tiles; 0 if the view is only drawn.
+    /// Intersections of splats with tiles; 0 for drawing only.
     pub(crate) n_slots: u32,
     pub(crate) n_bins: u32,
 }
@@ -282,7 +283,7 @@ impl Scratch {
     }
 }
 
-/// Buffers of one picture, and of its gradients if it is trained on.
+/// Buffers of one picture, and of its gradients in training.
 #[derive(Debug)]
 pub(crate) struct ImageBuffers {
     pub(crate) n_pixels: u32,
@@ -300,7 +301,7 @@ pub(crate) struct ImageBuffers {
 }
 
 impl ImageBuffers {
-    /// Allocates buffers for pictures of up to `n_pixels` and `n_tiles`; those of gradients only if `for_training`.
+    /// Allocates buffers for pictures of up to `n_pixels` and `n_tiles`, including gradients if `for_training`.
     pub(crate) fn new(gpu: &Gpu, n_pixels: u32, n_tiles: u32, for_training: bool) -> Result<Self, Error> {
         let each = |name: &str, bytes: u64| gpu.storage(name, bytes * u64::from(n_pixels));
         let gradient_buffer =

@@ -1,7 +1,7 @@
 //! Per-camera parameters that are optimized together with the splats: extrinsics, time offset, lens and exposure.
 //!
-//! All images of a camera share its parameters; each image can have its own in addition. Nothing is read back during
-//! training: `correct_view` prepares the view of a step, and `refine_camera` updates its parameters.
+//! All images of a camera share its parameters. Each image can have additional ones. The parameters stay on the GPU
+//! during training: `correct_view` applies them to the view of a step, and `refine_camera` updates them.
 
 use super::kernels::TrainPipelines;
 use super::params::{CameraRule, Lens, N_PARAMS};
@@ -16,13 +16,13 @@ use nalgebra::Vector3;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-/// Bits of the parameters that all images of a camera share.
+/// Bit mask of the parameters that all images of a camera share.
 fn camera_mask(set: ParamSet) -> u32 {
     let bits = |params: ParamSet, bits: u32| if set.contains(params) { bits } else { 0 };
     bits(ParamSet::EXTRINSICS, 0b11_1111) | bits(ParamSet::TIME_OFFSET, 1 << 6) | bits(ParamSet::LENS, 0b1111 << 7)
 }
 
-/// Bits of the parameters of single images.
+/// Bit mask of the per-image parameters.
 fn image_mask(set: ParamSet) -> u32 {
     let bits = |params: ParamSet, bits: u32| if set.contains(params) { bits } else { 0 };
     bits(ParamSet::IMAGE_POSES, 0b11_1111) | bits(ParamSet::IMAGE_GAINS, 0b111 << 11)
@@ -30,9 +30,9 @@ fn image_mask(set: ParamSet) -> u32 {
 
 /// Index of the first gain among the parameters, as in `shared/camera_params.wgsl`.
 const LOG_GAIN: u32 = 11;
-/// Initial learning rate of rotations, radians per step; the other rates are derived from it.
+/// Initial learning rate of rotations, radians per step. All other rates are derived from it.
 const ROTATION_RATE: f64 = 1e-3;
-/// Fraction of the rates that remains at the end of the planned steps.
+/// Fraction of the learning rates that remains after the planned steps.
 const FINAL_FRAC: f64 = 0.01;
 const IMAGE_DECAY: f64 = 0.001;
 
@@ -42,18 +42,18 @@ pub(crate) struct CameraParams {
     pub(crate) set: ParamSet,
     pub(crate) params: Buffer,
     rule: Buffer,
-    /// View of the current step.
+    /// Corrected view of the current step.
     pub(crate) corrected: Buffer,
     pub(crate) gains: Buffer,
     cameras: BTreeMap<Arc<str>, Slots>,
     n_used: u32,
 }
 
-/// For each camera, the slot of its parameters and the slots of its images by stamp in nanoseconds.
+/// Slots of each camera by name: the camera's slot, and the slots of its images by stamp in nanoseconds.
 #[derive(Clone, Debug, Default, PartialEq, serde::Serialize, serde::Deserialize)]
 pub(crate) struct CameraSlots(BTreeMap<String, (u32, BTreeMap<i64, u32>)>);
 
-/// Slots of [`N_PARAMS`] parameters for a camera and for its images.
+/// Slots of a camera and its images. Each slot holds [`N_PARAMS`] parameters.
 #[derive(Debug)]
 struct Slots {
     camera: u32,
@@ -73,13 +73,12 @@ impl CameraParams {
         })
     }
 
-    /// Adds parameters to the set that is optimized.
+    /// Adds parameters to the optimized set.
     pub(crate) fn enable(&mut self, more: ParamSet) {
         self.set |= more;
     }
 
-    /// Uploads the lens of a keyframe; allocates slots for the parameters of its camera and of the image if they are
-    /// new.
+    /// Uploads the lens of a keyframe. Allocates parameter slots for the camera and the image if they are new.
     pub(crate) fn lens(&mut self, gpu: &Gpu, keyframe: &Keyframe) -> Result<Buffer, Error> {
         let camera = match self.cameras.get(&keyframe.camera) {
             Some(slots) => slots.camera,
@@ -110,7 +109,7 @@ impl CameraParams {
         Ok(gpu.uniform_with("splat.lens", &lens))
     }
 
-    /// Sets the initial logarithms of the gains of an image.
+    /// Sets the initial log gains of an image.
     pub(crate) fn initialize_gains(&self, gpu: &Gpu, keyframe: &Keyframe, log_gains: [f64; 3]) {
         let slot = self.cameras.get(&keyframe.camera).and_then(|slots| slots.images.get(&keyframe.stamp));
         let values = log_gains.map(|value| [f32_of(value), 0.0, 0.0, 0.0]);
@@ -130,7 +129,7 @@ impl CameraParams {
         Ok(copy)
     }
 
-    /// Restores a copy. Slots allocated since then stay allocated, with parameters of zero.
+    /// Restores a copy. Slots allocated after the copy was made remain allocated, and their parameters become zero.
     pub(crate) fn restore_snapshot(&mut self, gpu: &Gpu, (set, params): (ParamSet, Buffer)) -> Result<(), Error> {
         self.set = set;
         if params.bytes() < self.used_bytes() {
@@ -240,9 +239,7 @@ impl CameraParams {
         let all = slots.0.values().flat_map(|(camera, images)| std::iter::once(camera).chain(images.values()));
         self.n_used = all.map(|slot| slot + 1).max().unwrap_or(0);
         if (self.n_used as usize) < n_slots {
-            return Err(Error::CheckpointState {
-                reason: "two cameras or images share a slot of camera parameters".to_owned(),
-            });
+            return Err(Error::CheckpointState { reason: "two cameras or images share a parameter slot".to_owned() });
         }
         let bytes = checkpoint.array("camera_params", self.used_bytes())?;
         self.params = gpu.storage_with("splat.camera_params", bytes)?;
@@ -258,7 +255,7 @@ impl CameraParams {
         Ok(())
     }
 
-    /// Corrections of all cameras from the parameters or from a copy of them.
+    /// Computes the corrections of all cameras from `params`, which is the parameter buffer or a copy of it.
     pub(crate) fn corrections(
         &self,
         gpu: &Gpu,
@@ -266,7 +263,7 @@ impl CameraParams {
         params: &Buffer,
         scene_size_m: f64,
     ) -> Result<BTreeMap<String, CameraCorrection>, Error> {
-        // A copy may be older than the newest slots.
+        // A copy may lack the newest slots.
         let mut params: Vec<[f32; 4]> = gpu.read(params, (self.used_bytes().min(params.bytes()) / 16) as usize)?;
         params.resize((self.n_used * N_PARAMS) as usize, [0.0; 4]);
         let value = |slot: u32, param: u32, learned: u32| {

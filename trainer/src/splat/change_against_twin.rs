@@ -10,7 +10,7 @@ use crate::gpu::{Gpu, GpuOptions, Passes, f32_of};
 use crate::loss::reference as loss_reference;
 use crate::mismatches::Mismatches;
 
-/// A small scene in which all splats have the same number of coefficients and values that f32 represents exactly.
+/// A small scene of splats with SH degree 3 and with values that f32 represents exactly.
 fn full_degree_scene(seed: u64, n: usize) -> Vec<Splat> {
     let mut splats = scene::small_scene(seed, n);
     for splat in &mut splats {
@@ -30,7 +30,7 @@ fn splats_of(arrays: &SplatArrays) -> Vec<Splat> {
     (0..arrays.n_splats()).map(one).collect()
 }
 
-/// Checks every value. `tolerances` are those of means, log scales, rotations, opacities and colors.
+/// Checks every value. `tolerances` apply to means, log scales, rotations, opacities and colors, in this order.
 fn check(got: &[Splat], expected: &[Splat], tolerances: [f64; 5]) {
     let [of_mean, of_scale, of_rotation, of_opacity, of_color] = tolerances;
     let mut mismatches = Mismatches::default();
@@ -58,7 +58,7 @@ fn check(got: &[Splat], expected: &[Splat], tolerances: [f64; 5]) {
     mismatches.assert_none();
 }
 
-/// Large enough relative to the gradients that no step is decided by the sign alone.
+/// Large enough that a step depends on the magnitude of a gradient, not only on its sign.
 const EPSILON: f32 = 1e-4;
 const RULE: Rule = Rule {
     mean_rate_m: 1e-2,
@@ -121,8 +121,8 @@ fn optimizer_steps_match_the_twin() {
         passes.submit(gpu);
         gpu.write(&fixture.status, 4 * status::STEP as u64, bytemuck::bytes_of(&(step + 1)));
     }
-    // A step is at most about as long as the rate. Gradients agree to a few thousandths of the largest, and EPSILON
-    // damps small ones.
+    // A step is at most about as large as the learning rate. Gradients differ by a few thousandths of the largest one,
+    // and EPSILON damps the steps of small gradients.
     let of = |rate: f32| 0.02 * f64::from(rate);
     let tolerances =
         [RULE.mean_rate_m, RULE.log_scale_rate, RULE.rotation_rate, RULE.opacity_rate, RULE.sh_dc_rate].map(of);
@@ -196,12 +196,12 @@ fn growth_matches_the_twin() {
     check(&splats_of(&fixture.splats.read(&gpu).unwrap()), &expected.splats, [2e-5, 2e-4, 1e-6, 1e-3, 1e-6]);
 }
 
-/// Rounded sums sometimes lead to a dead splat, to which another thread may be assigning a new position. The result
-/// must not depend on whether this has happened.
+/// Rounding sometimes selects a dead splat as a parent while another thread is replacing it. The result must not depend
+/// on the order of these threads.
 #[test]
 fn dead_splats_have_no_children() {
     const N_BEFORE: u32 = 60_000;
-    const N_AFTER: u32 = 1_200_000; // A few of a million choices are rounded to dead splats.
+    const N_AFTER: u32 = 1_200_000; // Rounding selects a dead splat in a few of a million choices.
     let mut random = scene::F32Random::new(12);
     let n = N_BEFORE as usize;
     let is_dead: Vec<bool> = (0..n).map(|_| random.uniform(0.0, 1.0) < 0.5).collect();
@@ -245,10 +245,10 @@ fn column(entries: &[[u32; 4]], part: usize) -> Vec<u32> {
     entries.iter().map(|entry| entry[part]).collect()
 }
 
-/// Checks the bins against a direct computation: a splat belongs to a tile if it reaches one of its pixels.
+/// Checks the bins against a direct computation: a splat belongs to a tile if it reaches a pixel of the tile.
 #[test]
 fn tile_lists_are_complete_and_depth_ordered() {
-    /// Squared Mahalanobis distance from the threshold within which f32 may decide either way.
+    /// Within this difference from the threshold (a squared Mahalanobis distance), f32 may decide either way.
     const MARGIN: f64 = 1e-3;
     let view = scene::tilted_view();
     let splats = full_degree_scene(10, 300);
@@ -266,7 +266,7 @@ fn tile_lists_are_complete_and_depth_ordered() {
         masks.iter().zip(&slots).flat_map(|(tiles, slot)| *slot..*slot + tiles.count_ones()).collect();
     taken.sort_unstable();
     assert!(taken.iter().copied().eq(0..u32::try_from(taken.len()).unwrap()), "every slot has one owner");
-    // Depth keys have 16 bits over the range of depths, divided into octaves with equal numbers of steps.
+    // Depth keys have 16 bits. They divide the range of depths into octaves, each with the same number of steps.
     let depths = || projected_splats.iter().map(|[position, ..]| position[2]).filter(|z| *z > 0.0);
     let octaves = (depths().fold(0.0, f32::max) / depths().fold(f32::INFINITY, f32::min)).log2();
     let key_step = (octaves + 1.0).log2().ceil().exp2() / 65536.0;

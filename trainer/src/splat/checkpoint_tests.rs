@@ -1,4 +1,4 @@
-//! Tests of checkpoints: a model that was interrupted and resumed is bit-identical to one that was not.
+//! Tests of checkpoints: a resumed model is bit-identical to a model trained without interruption.
 
 use super::SplatTrainer;
 use super::training_tests::{keyframes, options, train};
@@ -8,7 +8,7 @@ use crate::{Error, Method};
 use keyframe::Keyframe;
 use std::sync::Arc;
 
-/// Stops before the first change of the splat count and of the degree, and between later changes.
+/// Steps at which training stops: before the first change of splat count and SH degree, and between later changes.
 const STOPS: [u64; 3] = [7, 230, 310];
 const END: u64 = 340;
 
@@ -54,7 +54,7 @@ fn resuming_is_bit_exact() {
             let step = interrupted.progress().step;
             train(&mut interrupted, stop - step);
             if stop == 100 {
-                interrupted.push(keyframes[9].clone()).unwrap(); // Without depth, it waits for its splats.
+                interrupted.push(keyframes[9].clone()).unwrap(); // Without depth, it is not seeded yet.
             }
             let before = checkpoint_of(&mut interrupted);
             before.write(&path).unwrap();
@@ -90,7 +90,7 @@ fn checkpoint_and_training_do_not_affect_each_other() {
 }
 
 #[test]
-fn other_data_and_unknown_states_are_rejected() {
+fn different_data_and_invalid_states_are_rejected() {
     let gpu = Gpu::open(&GpuOptions::default()).unwrap();
     let keyframes = keyframes(&gpu, true);
     let mut trainer = new_trainer(&gpu, &keyframes, 500);

@@ -1,4 +1,4 @@
-//! Clouds for kernel benchmarks: synthetic ones, and files written by a peer implementation.
+//! Splats for kernel benchmarks: a synthetic cloud, or a file written by a peer implementation.
 
 use crate::Error;
 use crate::splat::arrays::SplatArrays;
@@ -14,11 +14,11 @@ use zip::result::ZipError;
 const SH_DEGREE: u32 = 3;
 const N_COEFFICIENTS: usize = 16;
 
-/// Generates `n_splats` random splats of color degree 3; the same for the same seed.
+/// Generates `n_splats` random splats of SH degree 3. Equal seeds give equal splats.
 ///
-/// Means are uniform in the cube from -1 to 1. Log scales are normal around `ln(0.6 / n^(1/3))` with a standard
-/// deviation of 0.3, rotations normal in four dimensions, and opacity logits normal with a standard deviation of 1.5.
-/// Color coefficients are normal with standard deviations of 0.5 for the constant one and 0.2 for the others.
+/// Means are uniform in the cube from -1 to 1. All other values are normally distributed. Log scales have a mean of
+/// `ln(0.6 / n^(1/3))` and a standard deviation of 0.3. The standard deviation is 1 for quaternion components, 1.5 for
+/// opacity logits, 0.5 for the constant color coefficient, and 0.2 for the other coefficients.
 #[expect(clippy::cast_possible_truncation, reason = "drawn in f64, used in f32")]
 pub fn synthetic_cloud(n_splats: usize, seed: u64) -> SplatArrays {
     let mut random = Random::new(seed);
@@ -88,7 +88,7 @@ mod tests {
         (mean, variance.sqrt())
     }
 
-    /// For 20 000 splats: five standard errors of the standard deviation of the smallest array.
+    /// Five standard errors of the standard deviation of the smallest array, for 20 000 splats.
     const DEVIATION_FRAC: f64 = 0.03;
 
     fn assert_spread(what: &str, values: &[f32], mean: f64, deviation: f64) {

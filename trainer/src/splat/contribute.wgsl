@@ -3,7 +3,7 @@
 // threads   256 per block of 256 splats
 // reads     model, status, tile_counts, slot_begins, gradients (from a `backward` pass with an error of one at every pixel)
 // writes    contributions [n_splats] (accumulated)
-// source    measure of Fan et al. 2024 (LightGaussian) and of Fang and Wang 2024 (Mini-Splatting), summed over views
+// source    contributions as in Fan et al. 2024 (LightGaussian) and Fang and Wang 2024 (Mini-Splatting), summed over views
 
 #import view
 #import model

@@ -1,4 +1,4 @@
-// count_bins: find the tiles that each splat touches, and count the splats of each block that reach each bin.
+// count_bins: find the tiles that each splat touches. For each block and bin, count the splats of the block in the bin.
 //
 // threads   256 per block of 256 splats in order of depth, and per window of 256 bins
 // reads     view, model, depth_keys (sorted), by_depth, projected_splats

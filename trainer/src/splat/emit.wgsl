@@ -1,8 +1,8 @@
-// emit: list every splat in the bins that it reaches, in order of depth.
+// emit: append every splat to the lists of the bins that it reaches, in order of depth.
 //
 // threads   256 per block of 256 splats in order of depth, and per window of 256 bins
 // reads     view, model, by_depth, touched, bin_counts, group_counts (offsets), bin_starts, slot_offsets, block_slots, status
-// writes    entries [n_entries] (splat; mask of the bin's tiles; slot of the first tile, followed by the others),
+// writes    entries [n_entries] (splat; mask of the touched tiles in the bin; first of their consecutive slots),
 //           slot_begins [n_splats]
 
 #import view

@@ -12,7 +12,7 @@ use keyframe::Keyframe;
 use std::path::Path;
 use std::sync::Arc;
 
-/// Splats as a method.
+/// Entry of the splat method.
 pub(crate) static ENTRY: MethodEntry = MethodEntry {
     name: SplatOptions::METHOD,
     description: "Gaussian splats",
@@ -51,7 +51,7 @@ fn resume(gpu: Arc<Gpu>, checkpoint: &Checkpoint, keyframes: &[Arc<Keyframe>]) -
 
 fn load(gpu: Arc<Gpu>, model: &Path) -> Result<Box<dyn Method>, Error> {
     let splats = file::read(model)?;
-    // The limit is for training; a saved model is shown completely.
+    // The limit applies only to training. A saved model is always loaded completely.
     let max_splats = u32::try_from(splats.n_splats()).unwrap_or(u32::MAX);
     let options = SplatOptions { max_splats, ..SplatOptions::default() };
     let trainer = SplatTrainer::from_arrays(gpu, options.into(), &splats)?;
@@ -69,11 +69,11 @@ fn write_spz(request: &ExportRequest<'_>) -> Result<Exported, Error> {
     write(request, Format::Spz)
 }
 
-/// Writes the splats after validating them.
+/// Validates the splats of a model and writes them to a file.
 fn write(request: &ExportRequest<'_>, format: Format) -> Result<Exported, Error> {
     let splats = file::read(request.model)?;
     file::write(request.out, format, &splats)?;
-    let detail = format!("of color degree {}", splats.sh_degree);
+    let detail = format!("of SH degree {}", splats.sh_degree);
     Ok(Exported { n_items: splats.n_splats() as u64, item: "splat", detail })
 }
 

@@ -1,19 +1,19 @@
-//! Files of splats: a `.ply`, a `.spz`, or the folder of a saved model.
+//! Reads splats from a `.ply` file, a `.spz` file or the folder of a saved model, and writes both file formats.
 
 use super::arrays::SplatArrays;
 use super::{ply, spz};
 use crate::Error;
 use std::path::{Path, PathBuf};
 
-/// The file of splats in the folder of a model.
+/// Name of the splat file in a model folder.
 pub(super) const IN_FOLDER: &str = "splats.ply";
 
-/// Format of a file of splats.
+/// Format of a splat file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Format {
-    /// All values at full precision.
+    /// Values at full precision.
     Ply,
-    /// Values quantized and compressed.
+    /// Quantized and compressed values.
     Spz,
 }
 
@@ -29,7 +29,7 @@ impl Format {
     }
 }
 
-/// Reads splats from the folder of a model or from a file.
+/// Reads splats from a file or from a model folder.
 pub(super) fn read(model: &Path) -> Result<SplatArrays, Error> {
     let is_file = model.is_file();
     let path: PathBuf = if is_file { model.to_owned() } else { model.join(IN_FOLDER) };

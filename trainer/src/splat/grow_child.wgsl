@@ -5,8 +5,9 @@
 // writes    means, rotations, shapes, sh_dc, sh_rest, all moments of the child; n_children [n_before] (cleared by the
 //           caller), parents [n_after]
 //
-// A child is never a parent: dead splats have weight zero and are not chosen, so no thread reads what another one
-// writes. Rounding of the sums can still select a splat of weight zero, in one or two choices per million.
+// Dead splats have weight zero and cannot be parents. A child is therefore never a parent, and no thread reads values
+// that another thread writes. In one or two choices per million, rounding of the sums selects a splat of weight zero.
+// Such a choice is discarded.
 
 #import view
 #import growth
@@ -54,7 +55,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
         if cumulative[middle] > within_block { high = middle; } else { parent = middle + 1u; }
     }
     if weights[parent] <= 0.0 {
-        // No error has been recorded yet: a new splat stays invisible until the next change of the splat count.
+        // No error is recorded yet, or rounding selected a dead splat. A new splat stays invisible until the next growth.
         if child >= growth.n_before {
             means[child] = vec4f(0.0);
             rotations[child] = vec4f(1.0, 0.0, 0.0, 0.0);
@@ -63,7 +64,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
         return;
     }
     parents[child] = parent;
-    atomicAdd(&n_children[parent], 1u); // Integer sums: the order does not matter.
+    atomicAdd(&n_children[parent], 1u); // Integer sums do not depend on the order.
 
     let shape = shapes[parent];
     let offset = rotation_of(rotations[parent]) * (exp(shape.xyz) * clamp(normal3(vec3u(child, growth.key, 11u)), vec3f(-2.0), vec3f(2.0)));

@@ -1,9 +1,9 @@
-// grow_family: share a parent's opacity among it and its children, and reset the error sums.
+// grow_family: divide a parent's opacity among the parent and its children, and reset the error sums.
 //
 // threads   one per splat up to n_after
 // reads     growth, n_children, parents
 // writes    shapes, moments, error_sums
-// source    Kheradmand et al. 2024 (3DGS-MCMC), equation 9: n splats at one position look like the original one
+// source    Kheradmand et al. 2024 (3DGS-MCMC), equation 9: n splats at one position look like the original splat
 
 #import view
 #import growth
@@ -16,7 +16,7 @@
 @group(0) @binding(5) var<storage, read_write> error_sums: array<f32>;
 
 override WG_SIZE = 256u;
-const MAX_FAMILY = 16u; // Larger families are treated as this large.
+const MAX_FAMILY = 16u; // Larger families are treated as if they had this size.
 
 @compute @workgroup_size(WG_SIZE)
 fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {

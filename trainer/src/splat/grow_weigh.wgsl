@@ -1,9 +1,9 @@
-// grow_weigh: compute each splat's weight for the choice of parents from its error, summed within blocks of 256.
+// grow_weigh: compute each splat's weight in the choice of parents from its error, and prefix sums within blocks of 256.
 //
 // threads   256 per block
 // reads     growth, means, shapes, error_sums
 // writes    weights [n_before] (0 where dead), cumulative [n_before] (within the block), block_weights [n_blocks]
-// source    error instead of opacity as the measure, after Bulo et al. 2024 (Revising densification)
+// source    weights from errors instead of opacities as in Bulo et al. 2024 (Revising densification)
 
 #import view
 #import growth

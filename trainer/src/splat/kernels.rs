@@ -42,7 +42,7 @@ const SHARED: &[Source] = &[
     source!("ssim_bindings"),
     source!("ssim_upstream", "ssim_upstream_window"),
 ];
-/// Imports of the loss kernels for adapters that keep windows of pixels in their lanes.
+/// Imports of the loss kernels for software adapters, where lanes hold windows of pixels.
 const LOSS_STRIPS: &[Source] = &[
     VIEW,
     STATUS,
@@ -67,10 +67,10 @@ macro_rules! update_sources {
         ]
     };
 }
-/// Imports of `update` if camera parameters are optimized, too.
+/// Imports of `update` when camera parameters are also optimized.
 const WITH_CAMERA: &[Source] = update_sources!("camera_sums_tree");
 
-/// Imports of the kernels over pixels.
+/// Imports of the per-pixel kernels.
 macro_rules! blend_sources {
     ($($source:expr),*) => {
         &[
@@ -100,11 +100,11 @@ macro_rules! kernel {
     };
 }
 
-/// The kernels over pixels, in the variant that suits the adapter.
+/// The per-pixel kernels, in the variant that suits the adapter.
 struct Blend {
     rasterize: Kernel,
     backward: Kernel,
-    /// Number of lanes of a subgroup, if `backward` needs it.
+    /// Number of lanes per subgroup, if `backward` needs it.
     subgroup: Option<u32>,
     in_strips: bool,
 }
@@ -200,14 +200,14 @@ impl DrawPipelines {
     }
 }
 
-/// Pipelines of the structural similarity, in the variant that suits the adapter.
+/// Pipelines of SSIM, in the variant that suits the adapter.
 #[derive(Debug)]
 pub(crate) enum Ssim {
     /// One kernel; `loss` gathers its gradients.
     Tiles(Pipeline),
     /// Workgroups of a few lanes, for software adapters.
     Strips {
-        /// Gradients with respect to the means over windows.
+        /// Computes the gradients with respect to the window means.
         means: Pipeline,
         /// Propagates these gradients to the pixels, for `loss`.
         upstream: Pipeline,
@@ -269,13 +269,13 @@ impl TrainPipelines {
         })
     }
 
-    /// The update kernel that returns gradients instead of new values, for comparison with the twin.
+    /// The update kernel in a variant that writes gradients instead of new values, for comparison with the twin.
     #[cfg(test)]
     pub(crate) fn gradients_only(gpu: &Gpu) -> Result<Pipeline, Error> {
         Pipeline::new(gpu, kernel!("update", WITH_CAMERA), &[("GRADIENTS_ONLY", 1.0)])
     }
 
-    /// The kernel of the camera parameters that returns gradients instead of new values.
+    /// The kernel of the camera parameters in a variant that writes gradients instead of new values.
     #[cfg(test)]
     pub(crate) fn camera_gradients_only(gpu: &Gpu) -> Result<Pipeline, Error> {
         Pipeline::new(gpu, kernel!("refine_camera"), &[("GRADIENTS_ONLY", 1.0)])

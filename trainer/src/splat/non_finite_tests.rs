@@ -10,7 +10,7 @@ use kinematics::{Stamp, Transform, Twist};
 use nalgebra::{Point3, Vector3};
 use std::sync::Arc;
 
-/// Trains on corrupted keyframes among valid ones; the result must be about as good as without them.
+/// Trains on valid and corrupted keyframes. The result must be about as good as with the valid keyframes alone.
 #[test]
 fn invalid_keyframes_do_not_affect_training() {
     const N_STEPS: u64 = 120;
@@ -61,7 +61,7 @@ fn invalid_keyframes_do_not_affect_training() {
     assert!(with > without - 1.5, "{with:.2} dB with corrupted keyframes, {without:.2} dB without");
 }
 
-/// Splats that a file may contain: on the camera plane, without rotation, huge, almost transparent.
+/// Extreme splats that a file may contain: on the camera plane, with a zero quaternion, huge, or almost transparent.
 #[test]
 fn invalid_splats_stay_finite_in_training() {
     let gpu = Gpu::open(&GpuOptions::default()).unwrap();

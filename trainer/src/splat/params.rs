@@ -1,4 +1,4 @@
-//! Small structs that the kernels read, with the layouts of their WGSL counterparts.
+//! Small structs that kernels read. Their layouts match their WGSL counterparts.
 
 pub(crate) use crate::view::{Camera, LOW_PASS_PX2, TILE_PX, View};
 
@@ -111,7 +111,7 @@ pub(crate) struct Growth {
     pub(crate) unused: f32,
 }
 
-/// `Gathering` of gather.wgsl: counts and strides of a copy of selected entries.
+/// `Gathering` of gather.wgsl: counts and strides for copying selected entries.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, Eq, bytemuck::Pod, bytemuck::Zeroable)]
 pub(crate) struct Gathering {

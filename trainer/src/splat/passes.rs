@@ -56,8 +56,8 @@ impl GrowthBuffers {
     }
 }
 
-/// Replaces dead splats by children of other splats and appends more children after `n_before`. Parents are chosen by
-/// their error.
+/// Replaces dead splats with children of other splats and appends children up to `n_after`. The probability of a parent
+/// is proportional to its error.
 pub(crate) fn grow(
     gpu: &Gpu,
     passes: &mut Passes,
@@ -119,14 +119,14 @@ pub(crate) fn grow(
     );
 }
 
-/// Number of workgroups of the kernels that import `rows_and_columns`: each handles one color of two vertically
-/// adjacent tiles.
+/// Number of workgroups of the kernels that import `rows_and_columns`. Each workgroup handles one color of two
+/// vertically adjacent tiles.
 fn n_color_strips(size_px: [u32; 2]) -> u64 {
     3 * u64::from(size_px[0].div_ceil(TILE_PX)) * u64::from(size_px[1].div_ceil(2 * TILE_PX))
 }
 
 impl ViewPasses<'_> {
-    /// Projects, sorts, bins and rasterizes.
+    /// Projects, sorts, bins and rasterizes the splats.
     pub(crate) fn draw(&self, passes: &mut Passes, pipelines: &DrawPipelines) {
         let Self { gpu, splats, scratch, image_buffers, status, view, size_px } = *self;
         let n_blocks = u64::from(splats.n_splats.div_ceil(BLOCK));
@@ -295,8 +295,8 @@ impl ViewPasses<'_> {
         );
     }
 
-    /// Adds each splat's contribution to the picture. Requires a previous [`ViewPasses::backward`] with an error of
-    /// one at every pixel.
+    /// Adds each splat's contribution to the picture to `contributions`. Requires a previous [`ViewPasses::backward`]
+    /// with an error of one at every pixel.
     pub(crate) fn contribute(&self, passes: &mut Passes, pipelines: &TrainPipelines, contributions: &Buffer) {
         let buffers = [
             ("model", &self.splats.model),
@@ -311,7 +311,7 @@ impl ViewPasses<'_> {
     }
 
     /// Propagates the gradients from the intersections to the parameters and takes one optimizer step. Set `camera`
-    /// if `update` is the kernel that also sums the gradients with respect to the camera.
+    /// if the kernel `update` also sums the camera gradients.
     pub(crate) fn update(&self, passes: &mut Passes, update: &Pipeline, rule: &Buffer, camera: bool) {
         let Self { gpu, splats, scratch, status, view, .. } = *self;
         let mut buffers = vec![("slot_begins", &scratch.slot_begins), ("gradients", &scratch.gradients)];

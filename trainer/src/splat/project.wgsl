@@ -2,7 +2,7 @@
 //
 // threads   one per splat
 // reads     view, model, means, rotations, shapes, sh_dc, sh_rest
-// writes    projected_splats [n_splats], depth_keys [n_splats] (all ones if invisible), status (nearest and furthest)
+// writes    projected_splats [n_splats], depth_keys [n_splats] (all ones if invisible), status (smallest and largest depth)
 // twin      splat/reference/project.rs
 // source    Zwicker et al. 2001 (EWA volume splatting); Kerbl et al. 2023, section 4
 
@@ -43,7 +43,7 @@ fn project(splat_ix: u32) -> u32 {
     let shape = shapes[splat_ix];
     let projection = project_splat(view, mean, rotations[splat_ix], shape.xyz);
     let opacity = sigmoid(shape.w);
-    // Written so that a splat with a NaN anywhere is invisible.
+    // These comparisons are false for NaN, so a splat with a NaN is invisible.
     let visible = projection.visible && opacity > MIN_ALPHA && projection.determinant > 0.0 && inside_crop(view, mean)
         && abs(projection.mean_px.x) < 1e6 && abs(projection.mean_px.y) < 1e6 && projection.covariance.x + projection.covariance.z < 1e12;
     if !visible { return INVISIBLE; }

@@ -36,7 +36,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     let first = tile.corner + lane_px(lane);
     let center_x = f32(first.x) + 0.5 + RAMP;
     let center_y = f32(first.y) + 0.5;
-    // Four named variables instead of an array, because arrays indexed by a variable live in memory.
+    // Four named variables instead of an array, because arrays with variable indices are stored in memory.
     var a = unblended(on_image(tile, first));
     var b = unblended(on_image(tile, first + vec2u(8u, 0u)));
     var c = unblended(on_image(tile, first + vec2u(0u, 8u)));

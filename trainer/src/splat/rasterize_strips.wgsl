@@ -1,4 +1,4 @@
-// rasterize_strips: `rasterize` for adapters whose lanes access memory one after another.
+// rasterize_strips: `rasterize` for software adapters, whose lanes access memory sequentially.
 //
 // threads   a workgroup of 8 per tile, which processes strips one after another (see `strips`)
 // reads     same as `rasterize`
@@ -40,7 +40,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
                 let owned = part + lane < queued.x;
                 var reaching = or_of_lanes(select(0u, 1u << lane, owned && reaches_strip(position, conic, top)));
                 loop {
-                    let some = reaching != 0u; // The loop body runs at least once.
+                    let some = reaching != 0u; // The loop body runs even if no splat reaches the strip.
                     let i = firstTrailingBit(reaching) & 7u;
                     reaching &= reaching - 1u;
                     let at = subgroupShuffle(position, i);

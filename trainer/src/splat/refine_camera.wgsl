@@ -1,4 +1,4 @@
-// refine_camera: sum the gradients with respect to the camera of one image, and take one optimizer step of its
+// refine_camera: sum the gradients with respect to the camera of one image, and take one optimizer step for the camera
 // parameters.
 //
 // threads   one workgroup of 256
@@ -6,7 +6,7 @@
 // writes    params
 // twin      splat/reference/project.rs (the view's gradient); optim/reference.rs
 //
-// Per-image parameters decay towards zero, so that the camera's parameters explain what all its images share.
+// Per-image parameters decay towards zero, so that corrections common to all images go to the shared parameters.
 
 #import view
 #import model
@@ -75,7 +75,7 @@ fn main(@builtin(local_invocation_index) lane: u32) {
         wg_sums[2] = total[2];
         wg_sums[3] = total[3];
     }
-    workgroupBarrier(); // The totals are where `gradient_of` reads them.
+    workgroupBarrier(); // The totals are written before `gradient_of` reads them.
     let param = min(lane, N_PARAMS - 1u);
     let gradient = gradient_of(param);
     let is_usable = lane < N_PARAMS && status[FAILED] == 0u && is_finite(gradient);

@@ -1,4 +1,4 @@
-// scan_bins: for each bin, count the entries of earlier groups of blocks and the total.
+// scan_bins: for each bin, sum the entries of all earlier groups (exclusive prefix sums) and of all groups (total).
 //
 // threads   one workgroup of 256 per bin
 // reads     view, model

@@ -1,16 +1,17 @@
-//! The schedule of training: when the splat count changes, and how far training has come.
+//! The training schedule: progress, and the steps at which the splat count and the SH degree change.
 
-/// Steps between changes of the splat count; the next constant is the step of the first change.
+/// Steps between changes of the splat count.
 pub(crate) const GROWTH_PERIOD: u64 = 100;
+/// Step of the first change of the splat count.
 const GROWTH_START: u64 = 200;
 /// Fraction of the planned steps after which the splat count stays constant.
 const GROWTH_END_FRAC: f64 = 0.75;
-/// Steps between increases of the active degree of spherical harmonics.
+/// Steps between increases of the active SH degree.
 const SH_PERIOD: u64 = 300;
-/// Highest degree of spherical harmonics.
+/// Maximum SH degree.
 const MAX_SH_DEGREE: u64 = 3;
 
-/// Position of training in its schedule.
+/// Position in the training schedule.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Schedule {
     /// Optimizer updates so far.
@@ -27,8 +28,8 @@ impl Schedule {
         Self { step: 0, start: 0, last_growth_step: 0, n_planned_steps }
     }
 
-    /// Moves the planned steps forward for a keyframe that arrives now: at least half of them remain, so that learning
-    /// rates are large enough for it and growth continues.
+    /// Moves the planned steps forward when a keyframe arrives, so that at least half of them remain. This keeps the
+    /// learning rates large enough for the new keyframe and continues growth.
     pub(super) fn extend_for_arrival(&mut self) {
         self.start = self.start.max(self.step.saturating_sub(self.n_planned_steps / 2));
     }
@@ -58,13 +59,13 @@ impl Schedule {
         GROWTH_PERIOD - self.step % GROWTH_PERIOD
     }
 
-    /// Degree of spherical harmonics to train, if there is memory for it.
+    /// SH degree to train at the current step, unless the model has a lower one.
     pub(super) fn active_degree(&self) -> u32 {
         u32::try_from((self.step / SH_PERIOD).min(MAX_SH_DEGREE)).expect("at most 3")
     }
 
-    /// Completed fraction of the planned steps at the last possible change: the first step of a submit depends on
-    /// timing, and values that are set once per submit must not depend on it.
+    /// Completed fraction of the planned steps at the last multiple of [`GROWTH_PERIOD`]. Values that are set once per
+    /// submit use this fraction, because the first step of a submit depends on timing.
     pub(super) fn completed_frac(&self) -> f64 {
         let step = self.step - self.step % GROWTH_PERIOD;
         step.saturating_sub(self.start) as f64 / self.n_planned_steps.max(1) as f64

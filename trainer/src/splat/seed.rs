@@ -14,14 +14,14 @@ use rayon::prelude::*;
 use std::collections::HashSet;
 use std::sync::Arc;
 
-/// Neighbors whose depths differ by more than this fraction are on different surfaces.
+/// Neighboring depths that differ by more than this fraction belong to different surfaces.
 const EDGE_FRAC: f64 = 0.04;
-/// Standard deviation of a disc in grid spacings: neighbors overlap without blurring.
+/// Standard deviation of a disc, in grid spacings. Neighbors overlap without blurring.
 const SPREAD: f64 = 0.6;
-/// Thickness of a disc in grid spacings.
+/// Thickness of a disc, in grid spacings.
 const THICKNESS: f64 = 0.15;
 const SEED_OPACITY: f64 = 0.7;
-/// Number of splats of a start without depth.
+/// Number of initial splats if there is no depth.
 const N_RANDOM: usize = 50_000;
 const RANDOM_OPACITY: f64 = 0.1;
 const SH_0: f64 = 0.282_094_791_773_878_14;
@@ -29,9 +29,9 @@ const SH_0: f64 = 0.282_094_791_773_878_14;
 /// Creates discs and stores the positions that already have splats.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Seeder {
-    /// Octave of the spacing, and the occupied cell at that size.
+    /// Occupied cells, each with the octave of its size.
     occupied_cells: HashSet<(i32, [i32; 3])>,
-    /// Positions of the discs in the world.
+    /// Positions of the discs, in the world.
     positions: Vec<Point3<f64>>,
 }
 
@@ -44,7 +44,7 @@ struct Disc {
     color: [f64; 3],
 }
 
-/// Number of discs per image if no part of it is covered yet.
+/// Density of discs in an image that no disc covers yet.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Density {
     /// Maximum number of discs.
@@ -53,11 +53,11 @@ pub(crate) struct Density {
     pub(crate) px_per_disc: f64,
 }
 
-/// Number of discs that an image may get regardless of its number of pixels.
+/// Number of discs that an image may get even if it has few pixels.
 const MIN_DISCS: f64 = 4000.0;
 
 impl Density {
-    /// Distance between discs, whole pixels.
+    /// Distance between discs in pixels, a whole number.
     fn stride_px(self, size_px: [u32; 2]) -> f64 {
         let n_pixels = f64::from(size_px[0]) * f64::from(size_px[1]);
         let n = self.max_discs.min((n_pixels / self.px_per_disc).max(MIN_DISCS));
@@ -66,11 +66,10 @@ impl Density {
 }
 
 impl Seeder {
-    /// Creates discs at the depth readings of these keyframes that no disc of similar spacing covers yet. Keyframes
-    /// without depth get none.
+    /// Creates discs at depth readings that no disc of similar spacing covers yet. Ignores keyframes without depth.
     ///
-    /// Keyframes are processed in batches. All keyframes of a batch propose discs in parallel, based on the earlier
-    /// batches; positions are then claimed sequentially, so the result does not depend on the number of processors.
+    /// Keyframes are processed in batches. The keyframes of a batch propose discs in parallel, given the discs of all
+    /// earlier batches. Positions are then claimed sequentially, so the result does not depend on thread scheduling.
     pub(crate) fn discs(&mut self, keyframes: &[Arc<Keyframe>], density: Density) -> SplatArrays {
         const BATCH: usize = 32;
         let mut seeds = Seeds::new();
@@ -86,7 +85,7 @@ impl Seeder {
         seeds.arrays
     }
 
-    /// Discs that a keyframe proposes at unoccupied positions.
+    /// Proposes discs at the unoccupied positions of a keyframe.
     fn candidate_discs(&self, keyframe: &Keyframe, density: Density) -> Vec<Disc> {
         let Some(depth) = &keyframe.depth else { return Vec::new() };
         let mut discs = Vec::new();
@@ -116,7 +115,7 @@ impl Seeder {
                 let down =
                     depth.point(x, y + stride, filled(neighbors[3])) - depth.point(x, y - stride, filled(neighbors[2]));
                 let normal = across.cross(&down).try_normalize(1e-12).unwrap_or_else(Vector3::z);
-                // At an oblique angle, the grid is wider on the surface.
+                // On an oblique surface, the grid points are further apart.
                 let slant = (normal.dot(&here.normalize()).abs()).max(0.3);
                 let size_m =
                     [SPREAD * spacing_m / slant.sqrt(), SPREAD * spacing_m / slant.sqrt(), THICKNESS * spacing_m];
@@ -126,8 +125,8 @@ impl Seeder {
         discs
     }
 
-    /// Creates discs for parts of a keyframe without depth that no disc covers, at the depths of the discs around
-    /// them in the image. Depths default to `default_m`.
+    /// Creates discs for the uncovered parts of a keyframe without depth. Their depths come from the nearest discs in
+    /// the image, or are `default_m` if there are none.
     pub(crate) fn discs_without_depth(&mut self, keyframe: &Keyframe, density: Density, default_m: f64) -> SplatArrays {
         let mut seeds = Seeds::new();
         let [width, height] = keyframe.size_px.map(f64::from);
@@ -168,21 +167,22 @@ impl Seeder {
         seeds.arrays
     }
 
-    /// Bytes of a position in a checkpoint, and of a cell.
+    /// Bytes of one position in a checkpoint.
     pub(crate) const POSITION_BYTES: u64 = 24;
+    /// Bytes of one cell in a checkpoint.
     pub(crate) const CELL_BYTES: u64 = 16;
 
-    /// Number of positions that have splats; each has a position and a cell.
+    /// Number of seeds. Each seed has one position and one cell.
     pub(crate) fn n_seeds(&self) -> usize {
         self.positions.len()
     }
 
-    /// Copies the state.
+    /// Copies the state for a checkpoint.
     pub(crate) fn snapshot(&self) -> SeedSnapshot {
         SeedSnapshot { positions: self.positions.clone(), cells: self.occupied_cells.iter().copied().collect() }
     }
 
-    /// Restores the output of [`SeedSnapshot::into_bytes`], or any whole number of positions and cells.
+    /// Restores the state from the output of [`SeedSnapshot::into_bytes`]. Ignores incomplete positions and cells.
     pub(crate) fn from_bytes(positions: &[u8], cells: &[u8]) -> Self {
         let positions = positions.as_chunks::<8>().0.iter().map(|bytes| f64::from_le_bytes(*bytes));
         let cells = cells.as_chunks::<4>().0.iter().map(|bytes| i32::from_le_bytes(*bytes));
@@ -222,7 +222,8 @@ pub(crate) struct SeedSnapshot {
 }
 
 impl SeedSnapshot {
-    /// Positions in the order in which they were seeded, x y z as f64; cells in ascending order, octave x y z as i32.
+    /// Returns the positions (x, y, z as f64) in seeding order, and the cells (octave, x, y, z as i32) in ascending
+    /// order.
     pub(crate) fn into_bytes(mut self) -> (Vec<u8>, Vec<u8>) {
         self.cells.sort_unstable();
         let positions =
@@ -258,8 +259,8 @@ impl InverseDepths {
         })
     }
 
-    /// Fills unknown cells with the mean of the known ones in the smallest enclosing square of 2, 4, 8, ... cells
-    /// that has any.
+    /// Fills each unknown cell with a mean of known cells. The mean is over the smallest enclosing square (2, 4, 8, ...
+    /// cells wide) that contains a known cell.
     fn filled(&self, default_per_m: f64) -> Vec<f64> {
         let [width, height] = self.n_cells;
         if width * height <= 1 {
@@ -292,7 +293,7 @@ pub(crate) fn random_cloud(keyframes: &[&Keyframe], seed: u64, n_max: usize) -> 
         let y = ((random.unit() * f64::from(height)) as u32).min(height - 1);
         let camera = keyframe.world_from_camera.translation.vector;
         let distance_m = (focus - camera).norm().max(1e-3);
-        // From a third of the distance to three times the distance, uniform in inverse depth beyond the focus.
+        // Depths range from a third to three times the distance. Beyond the focus, they are uniform in inverse depth.
         let share = random.unit();
         let z = distance_m * if share < 0.5 { 0.35 + 1.3 * share } else { 1.0 / (1.0 - 0.66 * (2.0 * share - 1.0)) };
         let ray = Vector3::new(
@@ -347,7 +348,7 @@ struct Seeds {
 }
 
 impl Seeds {
-    /// Creates an empty list of splats whose colors do not depend on the direction.
+    /// Creates an empty list of splats with view-independent colors.
     fn new() -> Self {
         Self { arrays: SplatArrays { sh_degree: 0, ..SplatArrays::default() } }
     }
@@ -374,8 +375,7 @@ mod tests {
     const WALL_M: f64 = 2.0;
     const DENSE: Density = Density { max_discs: 2000.0, px_per_disc: 1.0 };
 
-    /// A white wall in front of the camera. The image is `size_px` wide and high, with the principal point at its
-    /// center.
+    /// A keyframe that shows a white wall. The principal point is at the center of the image.
     fn wall_keyframe(size_px: [u32; 2], with_depth: bool) -> Keyframe {
         let principal_px = size_px.map(|px| f64::from(px) / 2.0);
         let n = (size_px[0] * size_px[1]) as usize;
@@ -413,14 +413,14 @@ mod tests {
     }
 
     #[test]
-    fn depthless_camera_seeds_only_uncovered_area() {
+    fn keyframe_without_depth_seeds_only_uncovered_areas() {
         let mut seeder = Seeder::default();
         let near = wall_keyframe([100, 80], true);
         let discs = seeder.discs(&[Arc::new(near)], DENSE);
         assert!(discs.means.len() > 1000);
         let wide = wall_keyframe([200, 80], false);
         let new_discs = seeder.discs_without_depth(&wide, Density { max_discs: 4000.0, px_per_disc: 1.0 }, 7.0);
-        // Half of the wide image is uncovered, except for a border of a cell or two.
+        // Half of the wide image is uncovered. One or two cells at the border count as covered.
         assert!((1500..=2100).contains(&new_discs.means.len()), "{} discs", new_discs.means.len());
         for mean in &new_discs.means {
             assert!((f64::from(mean[2]) - WALL_M).abs() < 1e-3, "expected at the depth of the wall: {mean:?}");

@@ -1,4 +1,4 @@
-//! The state of training that a rejected trial restores.
+//! Snapshots of the training state, which is restored when a trial is rejected.
 
 use super::buffers::SplatBuffers;
 use super::schedule::Schedule;
@@ -6,7 +6,7 @@ use super::seed::Seeder;
 use crate::gpu::Buffer;
 use calibration::ParamSet;
 
-/// The state that training changes, for restoring it later. No keyframe is waiting for its splats when it is taken.
+/// All state that training changes. A snapshot is only taken when every keyframe has been seeded.
 #[derive(Debug)]
 pub(crate) struct Snapshot {
     pub(super) splats: SplatBuffers,
@@ -15,10 +15,10 @@ pub(crate) struct Snapshot {
     pub(super) scene: ObservedScene,
 }
 
-/// What the keyframes so far show of the scene.
+/// Properties of the scene that are derived from the keyframes.
 #[derive(Clone, Debug)]
 pub(crate) struct ObservedScene {
-    /// Positions that have splats.
+    /// Seeded positions.
     pub(super) seeder: Seeder,
     /// Scale of the scene.
     pub(super) size_m: f64,

@@ -1,4 +1,4 @@
-// tile_bits: convert one mask of tiles per entry to one bit per entry for each of the 16 tiles.
+// tile_bits: transpose the entries' tile masks into one bit array for each of the bin's 16 tiles.
 //
 // threads   256 per 512 entries
 // reads     status, entries [n_entries]

@@ -1,4 +1,4 @@
-//! The splat model as a [`Method`]: composes the parts of training and drawing.
+//! The splat trainer: implements [`Method`] by combining the modules for training and drawing.
 
 mod checkpoint;
 mod lazy_pipelines;
@@ -60,12 +60,12 @@ pub struct SplatTrainer {
     views: ViewSet,
     seeding: Seeding,
     trials: SplatTrials,
-    /// Corrections of the saved model that this one was loaded from.
+    /// Camera corrections loaded with a saved model.
     saved_corrections: BTreeMap<String, CameraCorrection>,
 }
 
 impl SplatTrainer {
-    /// Creates an empty model. It can draw at once; the training pipelines are compiled on another thread.
+    /// Creates an empty model. Drawing works immediately; the training pipelines are compiled on another thread.
     pub fn new(gpu: Arc<Gpu>, options: ModelOptions<SplatOptions>) -> Result<Self, Error> {
         let pipelines = LazyPipelines::start(&gpu);
         Self::with_pipelines(gpu, options, pipelines)
@@ -91,8 +91,8 @@ impl SplatTrainer {
         })
     }
 
-    /// Creates a model of given splats, for drawing or training. The training pipelines are compiled at the first
-    /// step.
+    /// Creates a model from existing splats, for drawing or further training. The training pipelines are compiled at
+    /// the first step.
     pub fn from_arrays(
         gpu: Arc<Gpu>,
         options: ModelOptions<SplatOptions>,
@@ -132,7 +132,7 @@ impl SplatTrainer {
         &self.trials.finished
     }
 
-    /// Estimated corrections of each camera; empty if none are estimated.
+    /// Estimated corrections of each camera, or the loaded ones if none are estimated.
     pub fn camera_corrections(&mut self) -> Result<BTreeMap<String, CameraCorrection>, Error> {
         self.finish_in_flight()?;
         let cameras = &self.model.cameras;
@@ -166,7 +166,7 @@ impl SplatTrainer {
         self.model.add(&mut self.recorder, &mut self.renderer, arrays)
     }
 
-    /// Adds discs at new depth readings of the keyframes that arrived since the last call.
+    /// Seeds discs at the uncovered depth readings of the keyframes that arrived since the last call.
     fn seed_from_depth(&mut self) -> Result<(), Error> {
         match self.seeding.discs_from_depth(&self.views) {
             Some(discs) => self.add(&discs),
@@ -174,8 +174,7 @@ impl SplatTrainer {
         }
     }
 
-    /// Adds splats for areas that depth does not cover: discs for keyframes without depth, or a random cloud if there
-    /// is no depth at all.
+    /// Seeds the areas that depth does not cover. Uses discs if any keyframe has depth, and a random cloud otherwise.
     fn prepare_training(&mut self) -> Result<(), Error> {
         self.seed_from_depth()?;
         for keyframe in self.seeding.take_unseeded() {
@@ -194,7 +193,7 @@ impl SplatTrainer {
         Ok(())
     }
 
-    /// Draws one pinhole view of the splats that viewers see.
+    /// Draws one pinhole view of the displayed splats.
     fn draw_view(&mut self, camera: &Camera, background_srgb: [f32; 3], depth: bool) -> Result<Picture, Error> {
         let drawn = DrawnView { splats: self.trials.displayed(&self.model.splats), camera, background_srgb };
         self.renderer.picture(&mut self.recorder, drawn, depth)
@@ -215,7 +214,7 @@ impl Restartable for SplatTrainer {
         self.trials = SplatTrials::new(&options.common.cameras, options.specific.count);
         let poses = ParamSet::IMAGE_POSES;
         if alignment.has_image_poses() && self.trials.remove_candidate(poses) {
-            self.model.cameras.enable(poses); // Depth gives image poses to a few millimeters; the splats refine them.
+            self.model.cameras.enable(poses); // Aligned poses are accurate to millimeters; training refines them.
         }
         Ok(())
     }
@@ -227,7 +226,7 @@ impl Restartable for SplatTrainer {
 
 impl Method for SplatTrainer {
     fn push(&mut self, keyframe: Arc<Keyframe>) -> Result<(), Error> {
-        self.finish_in_flight()?; // Makes the step of its arrival exact.
+        self.finish_in_flight()?; // The step of the arrival must be exact.
         if keyframe.split == Split::Test {
             return Ok(());
         }
@@ -251,7 +250,7 @@ impl Method for SplatTrainer {
     }
 
     fn remove(&mut self, camera: &str, stamp: Stamp) -> Result<(), Error> {
-        self.finish_in_flight()?; // Makes the step of its removal exact.
+        self.finish_in_flight()?; // The step of the removal must be exact.
         let is_removed = |keyframe: &Keyframe| keyframe.camera.as_ref() == camera && keyframe.stamp == stamp;
         self.views.retain(|keyframe| !is_removed(keyframe));
         self.seeding.remove(is_removed);
@@ -265,7 +264,7 @@ impl Method for SplatTrainer {
     }
 
     fn is_idle(&self) -> bool {
-        false // There are always steps to take, or it is not known yet that there are none.
+        false // Training continues as long as there are keyframes.
     }
 
     fn n_total_steps(&mut self) -> Result<u64, Error> {
@@ -352,14 +351,14 @@ impl Method for SplatTrainer {
     }
 }
 
-/// What tests inspect and set.
+/// Accessors for tests.
 #[cfg(test)]
 impl SplatTrainer {
     pub(super) fn assume_step_millis(&mut self, millis: f64) {
         self.optimizer.submits.assume_step_millis(millis);
     }
 
-    /// Limits the bytes of images on the GPU, as on a software adapter.
+    /// Limits the GPU memory for images, as on a software adapter.
     pub(super) fn limit_image_bytes(&mut self, max_bytes: u64) {
         self.views.limit_image_bytes(max_bytes);
     }
@@ -372,7 +371,7 @@ impl SplatTrainer {
         self.recorder.gpu.read::<u32>(&self.optimizer.status, status::LEN).unwrap()[status::STEP].into()
     }
 
-    /// Number of positions that are seeded.
+    /// Number of seeded positions.
     pub(super) fn n_seeds(&self) -> usize {
         self.seeding.scene.seeder.n_seeds()
     }

@@ -31,14 +31,14 @@ fn scene() -> SplatArrays {
     }
     arrays.log_scales.fill([-0.6, -0.6, -4.0]);
     arrays.opacity_logits.fill(4.0);
-    arrays.sh.chunks_exact_mut(16).for_each(|coeffs| coeffs[1..].fill([0.0; 3])); // No dependence on the direction.
+    arrays.sh.chunks_exact_mut(16).for_each(|coeffs| coeffs[1..].fill([0.0; 3])); // View-independent.
     arrays
 }
 
 fn pose(ix: usize) -> Transform {
     let angle = ix as f64 * 0.12;
     let eye = Point3::new(3.2 * angle.sin(), -0.4 + 0.05 * ix as f64, -3.2 * angle.cos());
-    // `face_towards` has z forward; this rotates y to point down.
+    // `face_towards` returns a frame with z forward. The rotation makes y point down.
     Transform::face_towards(&eye, &Point3::origin(), &Vector3::new(0.0, -1.0, 0.0))
         * nalgebra::UnitQuaternion::from_axis_angle(&Vector3::z_axis(), std::f64::consts::PI)
 }
@@ -125,7 +125,7 @@ fn train_one_by_one(trainer: &mut SplatTrainer, n_steps: u64) {
     }
 }
 
-/// Trains in submits of up to 40 steps, one of which is always in flight.
+/// Trains in submits of up to 40 steps. One submit is always in flight.
 fn train_in_long_submits(trainer: &mut SplatTrainer, n_steps: u64) {
     let end = trainer.progress().step + n_steps;
     while trainer.progress().step < end {
@@ -166,9 +166,9 @@ fn training_predicts_test_views_and_is_reproducible() {
     assert!(run(2).2 != arrays, "the seed has no effect: the comparison cannot fail");
 }
 
-/// On a software adapter, images are evicted from the GPU, so memory is bounded for any number of keyframes.
+/// A software adapter evicts images, which bounds the memory for any number of keyframes.
 #[test]
-fn image_memory_limit_holds_and_changes_no_bit() {
+fn image_memory_limit_holds_and_does_not_change_the_result() {
     const LEVEL_0_BYTES: u64 = 8 * SIZE_PX[0] as u64 * SIZE_PX[1] as u64;
     let gpu = Gpu::open(&GpuOptions::default()).unwrap();
     let keyframes = n_keyframes(&gpu, 20, true);
@@ -183,7 +183,7 @@ fn image_memory_limit_holds_and_changes_no_bit() {
         (trainer.image_bytes(), gpu.live_bytes(), trainer.arrays().unwrap())
     };
     let (image_bytes, live_bytes, arrays) = run(u64::MAX, train);
-    // On a real GPU, how many images are uploaded ahead depends on its speed.
+    // On a real GPU, the number of images that are uploaded ahead depends on the speed of the GPU.
     if gpu.is_software() {
         assert!(image_bytes >= n_train * LEVEL_0_BYTES && image_bytes < keyframes.len() as u64 * LEVEL_0_BYTES);
         assert!(
@@ -194,11 +194,11 @@ fn image_memory_limit_holds_and_changes_no_bit() {
 
     let max_bytes = 3 * LEVEL_0_BYTES;
     let (bounded_bytes, bounded_live, bounded) = run(max_bytes, train_one_by_one);
-    // A real GPU uploads the images of many steps for one submit, which may need more.
+    // A real GPU uploads the images of many steps for one submit, which may exceed the limit.
     if gpu.is_software() {
         assert!((1..=max_bytes).contains(&bounded_bytes), "{bounded_bytes} bytes of images");
     }
-    // Buffers of longer submits are slightly larger; the difference is less than any image.
+    // Longer submits have slightly larger buffers, but the difference is smaller than any image.
     let unexplained = (live_bytes - bounded_live).abs_diff(image_bytes - bounded_bytes);
     assert!(unexplained < LEVEL_0_BYTES / 4, "evicted images were not freed: {unexplained} bytes");
     assert!(bounded == arrays, "the memory limit changed the result");
@@ -223,9 +223,9 @@ fn trains_without_depth_from_random_points() {
     assert!(after > before + 2.0, "{before} -> {after} dB");
 }
 
-/// Depth from a range scanner: a band of coarse cells.
+/// The depth covers a band of coarse cells, as from a range scanner.
 #[test]
-fn area_outside_a_depth_band_is_seeded_from_it() {
+fn areas_outside_a_depth_band_are_seeded_at_its_depth() {
     const SHARE: u32 = 4;
     let gpu = Gpu::open(&GpuOptions::default()).unwrap();
     let with_band = |keyframe: Arc<Keyframe>| {
@@ -265,7 +265,7 @@ fn area_outside_a_depth_band_is_seeded_from_it() {
     assert!(test_psnr(&mut trainer, &keyframes) > 20.0, "{}", test_psnr(&mut trainer, &keyframes));
 }
 
-/// A live scan may last longer than planned: areas that arrive late still get splats.
+/// A live scan may last longer than planned. Areas that arrive late must still get splats.
 #[test]
 fn late_keyframe_resumes_growth() {
     let gpu = Gpu::open(&GpuOptions::default()).unwrap();
@@ -280,7 +280,7 @@ fn late_keyframe_resumes_growth() {
     };
     let planned = n_splats_after(&mut trainer, 300);
     assert_eq!(n_splats_after(&mut trainer, 200), planned, "growth has ended");
-    // The same image again: it has no uncovered area for seeds.
+    // A second copy of an image has no uncovered area to seed.
     trainer.push(Arc::new(Keyframe { stamp: Stamp(99), ..keyframes[1].as_ref().clone() })).unwrap();
     assert!(n_splats_after(&mut trainer, 120) > planned, "growth continues");
 }
@@ -315,7 +315,7 @@ fn wrong_lens_is_corrected_by_trial() {
     train(&mut trainer, 900);
     let found_focal_px = trainer.calibrated_camera(&miscalibrated[0]).unwrap().focal_px;
     assert!(trainer.trials()[0].kept, "{:?}, focal length {found_focal_px:?}", trainer.trials());
-    // The cameras rotate about the vertical axis only, which determines the horizontal focal length. 400 steps
+    // The cameras rotate only about the vertical axis, so only the horizontal focal length is determined. 400 steps
     // correct about half of the error.
     assert!(
         (found_focal_px[0] / FOCAL_PX - 1.0).abs() < 0.6 * (FOCAL_ERROR - 1.0),
@@ -324,7 +324,7 @@ fn wrong_lens_is_corrected_by_trial() {
 }
 
 #[test]
-fn running_trial_is_not_saved_and_is_repeated() {
+fn running_trial_is_not_saved_but_repeated() {
     let gpu = Gpu::open(&GpuOptions::default()).unwrap();
     let keyframes = n_keyframes(&gpu, 36, true);
     let mut trainer = trainer_with_lens_trial(&keyframes, gpu, 300);
@@ -340,7 +340,7 @@ fn running_trial_is_not_saved_and_is_repeated() {
     assert_eq!(trainer.trials().len(), 1);
 }
 
-/// Black splats are invisible in front of a black background, but they occlude and have a depth.
+/// Black splats are invisible in front of a black background, but they must still occlude and have a depth.
 #[test]
 fn black_objects_stay_opaque() {
     let gpu = Gpu::open(&GpuOptions::default()).unwrap();
@@ -389,7 +389,7 @@ fn scratch_memory_grows_when_a_view_needs_more() {
     for keyframe in &keyframes[1..4] {
         trainer.push(Arc::new(Keyframe { depth: None, ..keyframe.as_ref().clone() })).unwrap();
     }
-    // The buffers are too small at first. The data read back must come from the attempt with sufficient capacity.
+    // The buffers are too small at first. The result must come from the second attempt, with larger buffers.
     let large = RenderRequest { size_px: [640, 480], ..request(pose(0)) };
     let [first, second] = [0, 1].map(|_| trainer.render(&large).unwrap());
     assert!(first.rgba_srgb == second.rgba_srgb && first.depth_m == second.depth_m);
@@ -428,10 +428,9 @@ fn equirectangular_agrees_with_pinhole() {
     );
 }
 
-/// The number of steps per submit depends on timing, so it must not affect the result, with or without camera
-/// parameters.
+/// The number of steps per submit depends on timing, so it must not affect splats or camera parameters.
 #[test]
-fn submit_length_changes_no_bit() {
+fn submit_length_does_not_change_the_result() {
     let gpu = Gpu::open(&GpuOptions::default()).unwrap();
     let keyframes = keyframes(&gpu, true);
     let params = ParamSet::EXTRINSICS | ParamSet::TIME_OFFSET;
@@ -447,9 +446,9 @@ fn submit_length_changes_no_bit() {
     assert!(learned(train_in_long_submits) == learned(train_one_by_one));
 }
 
-/// Viewers do not change the result: submits are shorter, and images are uploaded in smaller batches.
+/// With a viewer, submits are shorter and images are uploaded in smaller batches. This must not change the result.
 #[test]
-fn viewers_shorten_submits_and_change_no_bit() {
+fn viewers_shorten_submits_but_do_not_change_the_result() {
     let gpu = Gpu::open(&GpuOptions::default()).unwrap();
     let keyframes = keyframes(&gpu, true);
     let learned = |watched: bool| {
@@ -474,9 +473,9 @@ fn viewers_shorten_submits_and_change_no_bit() {
     assert!(learned(true) == learned(false));
 }
 
-/// Submit lengths do not affect the result when a trial ends and validation images become training images, either.
+/// Submit lengths must not affect the end of a trial, after which validation images become training images.
 #[test]
-fn submit_length_changes_no_bit_of_a_trial() {
+fn submit_length_does_not_change_the_result_of_a_trial() {
     let gpu = Gpu::open(&GpuOptions::default()).unwrap();
     let keyframes = n_keyframes(&gpu, 36, true);
     let learned = |train: fn(&mut SplatTrainer, u64)| {
@@ -488,15 +487,15 @@ fn submit_length_changes_no_bit_of_a_trial() {
     assert!(learned(train_in_long_submits) == learned(train_one_by_one));
 }
 
-/// A submit with too many intersections for the buffers is repeated, and the submit sent after it is not counted
+/// A submit that overflows the intersection buffers is repeated together with the submit after it. No step may count
 /// twice.
 #[test]
-fn buffer_overflow_changes_no_bit() {
+fn buffer_overflow_does_not_change_the_result() {
     const N_STEPS: u64 = 90;
     let gpu = Gpu::open(&GpuOptions::default()).unwrap();
     let keyframes = keyframes(&gpu, false);
     let mut cloud = synthetic_cloud(4000, 5);
-    cloud.log_scales.fill([1.5; 3]); // Each covers every image: more intersections at full size than fit.
+    cloud.log_scales.fill([1.5; 3]); // Every splat covers every image, which overflows the buffers at full resolution.
     let learned = |train: fn(&mut SplatTrainer, u64)| {
         let mut trainer = SplatTrainer::from_arrays(gpu.clone(), options(), &cloud).unwrap();
         for keyframe in &keyframes {

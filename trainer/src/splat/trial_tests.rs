@@ -11,7 +11,7 @@ use calibration::{CameraRefinement, ParamSet, Trial};
 use keyframe::{Keyframe, Split};
 use std::sync::Arc;
 
-/// Steps of each half of a trial of parameters that all images share.
+/// Steps of each half of a trial of shared parameters.
 const HALF: u64 = 250;
 const END: u64 = TRIAL_START + 2 * HALF;
 
@@ -31,7 +31,7 @@ fn with_split(keyframe: &Arc<Keyframe>, split: Split) -> Arc<Keyframe> {
     Arc::new(Keyframe { split, ..keyframe.as_ref().clone() })
 }
 
-/// Trains up to a total number of updates, including those of trials.
+/// Trains up to a total number of updates, including updates that trials reverted.
 fn train_to(trainer: &mut SplatTrainer, n_total_steps: u64) {
     while trainer.n_total_steps().unwrap() < n_total_steps {
         let n_left = n_total_steps - trainer.n_total_steps().unwrap();
@@ -45,13 +45,13 @@ fn lens() -> ParamSet {
 
 const N_EARLY: usize = 30;
 
-/// Keyframes all around the scene; every fourth one is a validation keyframe.
+/// Keyframes all around the scene. Every fourth is a validation keyframe.
 fn around(gpu: &Arc<Gpu>) -> Vec<Arc<Keyframe>> {
     let split = |ix: usize| if ix.is_multiple_of(4) { Split::Validation } else { Split::Train };
     n_keyframes(gpu, 46, true).iter().enumerate().map(|(ix, keyframe)| with_split(keyframe, split(ix))).collect()
 }
 
-/// Adds keyframes before the trial, in its first half and in its second half; returns after the end of the trial.
+/// Adds keyframes before a trial, in its first half and in its second half, and trains past the end of the trial.
 fn trial_with_arrivals(gpu: &Arc<Gpu>, candidate: ParamSet, keyframes: &[Arc<Keyframe>]) -> SplatTrainer {
     let (early, late) = keyframes.split_at(N_EARLY);
     let (first_half, second_half) = late.split_at(8);
@@ -76,7 +76,7 @@ fn assert_all_seeds_kept(trainer: &SplatTrainer, keyframes: &[Arc<Keyframe>]) {
 }
 
 #[test]
-fn no_op_trial_scores_equal_while_keyframes_arrive() {
+fn no_op_trial_has_zero_gain_while_keyframes_arrive() {
     let gpu = Gpu::open(&GpuOptions::default()).unwrap();
     let keyframes = around(&gpu);
     let trainer = trial_with_arrivals(&gpu, ParamSet::empty(), &keyframes);
@@ -114,7 +114,7 @@ fn both_halves_score_the_same_images() {
     let mut trainer = trainer_with_candidate(&gpu, ParamSet::empty());
     let (early, late) = validation.split_at(N_FIRST);
     train.chain(early.iter().cloned()).for_each(|keyframe| trainer.push(keyframe).unwrap());
-    // In both halves, more keyframes arrive than are scored, and two of the scored ones are removed.
+    // Validation keyframes arrive in both halves, and each half loses one of the scored keyframes.
     for (ix, keyframe) in late.iter().enumerate() {
         train_to(&mut trainer, TRIAL_START + 10 + 24 * ix as u64);
         trainer.push(keyframe.clone()).unwrap();
@@ -136,12 +136,12 @@ fn both_halves_score_the_same_images() {
 fn resuming_in_either_trial_half_is_bit_exact() {
     let gpu = Gpu::open(&GpuOptions::default()).unwrap();
     let keyframes = n_keyframes(&gpu, 42, true);
-    // Times at which keyframes arrive, and at which training stops and resumes, in total updates.
+    // Arrivals of keyframes and interruptions of training, in total updates.
     let arrivals: Vec<u64> = (0..42).map(|ix| if ix < 36 { 0 } else { TRIAL_START - 60 + 120 * (ix - 35) }).collect();
     let stops = [TRIAL_START - 10, TRIAL_START + 70, TRIAL_START + HALF + 30, TRIAL_START + HALF + 140, END + 20];
     let run = |stops: &[u64]| {
         let mut trainer = trainer_with_candidate(&gpu, lens());
-        let mut n_taken_before = 0; // A checkpoint does not count updates that a trial reverted.
+        let mut n_taken_before = 0; // Reverted updates, which a checkpoint does not count.
         let mut n_pushed = 0;
         let times: std::collections::BTreeSet<u64> = arrivals.iter().chain(stops).copied().chain([END + 40]).collect();
         for time in times {

@@ -1,11 +1,11 @@
 //! A/B trials that decide whether a change of the model is kept. Each change is tested on a copy of the model and
-//! evaluated on validation images, which are not trained on.
+//! evaluated on validation images, which are excluded from training.
 //!
 //! The baseline and the variant with the change are trained from the same state for the same number of steps.
-//! Keyframes that arrive during a trial are added to both at the same step, or wait for the end of the trial. An
-//! addition is accepted if the paired gain on the validation keyframes exceeds a minimum gain and two standard
-//! errors. A reduction is accepted if its loss plus half a standard error is at most a minimum gain, and the total
-//! loss of all reductions is at most [`MAX_TOTAL_LOSS_DB`]. After the last trial, the validation keyframes become
+//! Keyframes that arrive during the first half of a trial are added to both at the same step; later ones wait for the
+//! end of the trial. An addition is accepted if its mean gain over the validation keyframes exceeds both a minimum and
+//! two standard errors. A reduction is accepted if its loss plus half a standard error stays within a limit, and the
+//! total loss of all reductions is at most [`MAX_TOTAL_LOSS_DB`]. After the last trial, the validation keyframes become
 //! training keyframes.
 
 use super::buffers::SplatBuffers;
@@ -19,21 +19,21 @@ use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 
-/// Step of the first trial; before it, the scene is too coarse for a decision.
+/// Step of the first trial. Before this step, the model is too coarse for a decision.
 pub(crate) const TRIAL_START: u64 = 500;
-/// Steps of a trial of parameters shared by all images, and minimum for all trials.
+/// Steps of each half of a trial. Trials of per-image parameters may take more steps.
 const SHARED_STEPS: u64 = 250;
-/// Steps per image in a trial of per-image parameters. The next constant limits the total.
+/// Steps per image in each half of a trial of per-image parameters, up to [`MAX_STEPS`] in total.
 const STEPS_PER_IMAGE: u64 = 4;
 const MAX_STEPS: u64 = 1200;
 /// Maximum total loss of all accepted reductions, dB.
 const MAX_TOTAL_LOSS_DB: f64 = 0.15;
-/// Maximum number of validation keyframes in a mean score.
+/// Maximum number of validation keyframes that are scored.
 pub(crate) const MAX_SCORED: usize = 24;
-/// The number of splats is not halved further below this value.
+/// Halving ends once the number of splats is at most this value.
 const MIN_SPLATS: u32 = 1000;
 
-/// Per-image gains. Their effect follows from sums over pixels, so they are evaluated without training.
+/// Per-image gains. Their trial needs no training, because their effect follows from sums over pixels.
 const GAINS: ParamSet = ParamSet::IMAGE_GAINS;
 
 /// How the number of splats is chosen.
@@ -42,7 +42,7 @@ pub enum CountPolicy {
     /// Grows up to the limit.
     #[default]
     ToCap,
-    /// Grows up to the limit, then halves the number as long as the loss on validation images is less than 0.1 dB.
+    /// Grows up to the limit. Then halves the number repeatedly while this costs less than 0.1 dB on validation images.
     Tested,
 }
 
@@ -54,7 +54,7 @@ pub(crate) struct ValidationImage {
 }
 
 impl ValidationImage {
-    /// The image on the GPU.
+    /// The image on the GPU, uploaded on first use.
     pub(crate) fn uploaded(&mut self, gpu: &Gpu) -> Result<&Buffer, Error> {
         let image = match self.image.take() {
             Some(image) => image,
@@ -86,16 +86,16 @@ pub(crate) struct Arrival {
     pub(crate) keyframe: Arc<Keyframe>,
 }
 
-/// State of the choice of the number of splats.
+/// Progress of the search for the number of splats.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) enum CountState {
     /// Grows up to the limit without trials.
     ToCap,
     /// Grows; trials start once growth has ended.
     Growing,
-    /// Halved repeatedly until half is not sufficient.
+    /// Trials halve the number until one of them is rejected.
     Halving,
-    /// Constant.
+    /// The number is final.
     Finished,
 }
 
@@ -104,7 +104,7 @@ pub(crate) enum CountState {
 pub(crate) struct SplatTrials {
     candidates: VecDeque<ParamSet>,
     count: CountState,
-    /// Color degree that is tried next, once the number of splats is final.
+    /// SH degree to try next, once the number of splats is final.
     degree: u32,
     pub(crate) validation: Vec<ValidationImage>,
     pub(crate) finished: Vec<Trial>,
@@ -126,16 +126,16 @@ pub(crate) struct RunningTrial {
     pub(crate) candidate: Candidate,
     /// Last step of this half.
     pub(crate) until: u64,
-    /// The state that is not in training: the start of the trial during the first half, the end of the first half
-    /// during the second.
+    /// The state that is not in training. In the first half of a trial, this is the state at the start of the trial; in
+    /// the second half, the state at the end of the first half.
     pub(crate) other: Box<Snapshot>,
     /// The validation keyframes on which both halves are scored.
     pub(crate) scored: Vec<ImageId>,
-    /// In the first half, the keyframes that arrived; in the second half, those that have not arrived again yet.
+    /// Keyframes that arrived in the first half. The second half takes them from this queue at the same steps.
     pub(crate) arrivals: VecDeque<Arrival>,
     /// Scores at the end of the first half, which trains the baseline.
     pub(crate) baseline_db: Option<Scores>,
-    /// Keyframes that arrived in the second half and wait for its end.
+    /// Keyframes that arrived in the second half. They are added after the trial.
     pub(crate) deferred: Vec<Arc<Keyframe>>,
 }
 
@@ -145,7 +145,7 @@ pub(crate) struct SecondHalf {
     pub(crate) from: Snapshot,
     /// The change to apply to it.
     pub(crate) candidate: Candidate,
-    /// Keyframes to remove, because they arrive again.
+    /// Keyframes to remove, because the second half adds them again.
     pub(crate) arrived: Vec<Arc<Keyframe>>,
 }
 
@@ -159,7 +159,7 @@ pub(crate) struct TrialEnd {
     pub(crate) deferred: Vec<Arc<Keyframe>>,
 }
 
-/// The remaining candidates.
+/// The remaining candidates, for a checkpoint.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct RemainingTrials {
@@ -172,13 +172,12 @@ pub(crate) struct RemainingTrials {
 /// Work that is due at a step.
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) enum Due {
-    /// Nothing.
     Nothing,
     /// Copy the state and start the trial.
     Begin(Candidate),
     /// Score the baseline, restore the copy and apply the change.
     BeginSecondHalf,
-    /// Add a keyframe that arrived at this step of the first half.
+    /// In the second half, add a keyframe that arrived at this step of the first half.
     Arrival,
     /// Score the variant and decide.
     End,
@@ -188,14 +187,15 @@ pub(crate) enum Due {
     ReleaseValidation,
 }
 
-/// State of the splats that determines what is due.
+/// State of the model that determines which work is due.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct TrialContext {
     pub(crate) step: u64,
     pub(crate) n_splats: u32,
-    /// Whether growth has ended. Before that, few splats score as well as many, which converge more slowly.
+    /// Whether growth has ended. Before that, a small model may score as well as a large one only because it converges
+    /// faster.
     pub(crate) is_mature: bool,
-    /// Degree of the colors.
+    /// SH degree.
     pub(crate) sh_degree: u32,
 }
 
@@ -205,7 +205,7 @@ impl RunningTrial {
         self.baseline_db.is_some()
     }
 
-    /// Step at which a keyframe arrives again.
+    /// Step at which the second half adds the next keyframe that arrived in the first half.
     fn next_arrival_step(&self) -> u64 {
         self.arrivals.front().filter(|_| self.is_second_half()).map_or(u64::MAX, |next_due| next_due.step)
     }
@@ -269,7 +269,7 @@ impl SplatTrials {
             return Due::Nothing;
         }
         if self.validation.len() < MIN_VALIDATION_IMAGES {
-            // More may arrive; the wait is limited.
+            // Wait for more images, but not indefinitely.
             return if context.step < 2 * TRIAL_START { Due::Nothing } else { Due::ReleaseValidation };
         }
         if let Some(params) = self.candidates.front() {
@@ -287,7 +287,7 @@ impl SplatTrials {
         }
     }
 
-    /// Number of steps until something may be due again.
+    /// Number of steps until work may be due again.
     pub(crate) fn steps_left(&self, step: u64) -> u64 {
         match &self.trial_phase {
             SplatTrialPhase::Waiting if step < TRIAL_START => TRIAL_START - step,
@@ -313,7 +313,7 @@ impl SplatTrials {
         trial.arrivals.pop_front().map(|arrival| arrival.keyframe)
     }
 
-    /// The validation keyframes to score: those of the trial in progress, or else a subset spread evenly over all.
+    /// The validation keyframes to score: those of the running trial, or else an evenly spaced subset.
     pub(crate) fn scored(&self) -> Vec<ImageId> {
         let stride = self.validation.len().div_ceil(MAX_SCORED).max(1);
         let spread = || self.validation.iter().step_by(stride).map(|validation| id_of(&validation.keyframe)).collect();
@@ -380,7 +380,7 @@ impl SplatTrials {
     }
 
     fn evaluate(&mut self, candidate: Candidate, baseline_db: &[f64], variant_db: &[f64]) -> bool {
-        log::debug!("{candidate}: without {baseline_db:.3?}, with {variant_db:.3?} dB");
+        log::debug!("{candidate}: PSNR without the change {baseline_db:.3?} dB, with it {variant_db:.3?} dB");
         let mut trial = Trial::of(candidate, baseline_db, variant_db);
         let reductions = self.finished.iter().filter(|finished| finished.kept && finished.candidate.reduces_model());
         let total_loss_db: f64 = reductions.map(|finished| (-finished.gain_db).max(0.0)).sum();
@@ -391,14 +391,14 @@ impl SplatTrials {
         kept
     }
 
-    /// Cancels the trial in progress; it is repeated if training continues.
+    /// Cancels a trial that is in its second half. The trial is repeated if training continues.
     pub(crate) fn cancel(&mut self) -> Option<TrialEnd> {
         let RunningTrial { other, arrivals, deferred, .. } = self.take_second_half()?;
         let seeded = arrivals.into_iter().map(|arrival| arrival.keyframe).collect();
         Some(TrialEnd { restored: Some(*other), seeded, deferred })
     }
 
-    /// Ends a trial in its second half.
+    /// Takes the running trial if it is in its second half.
     fn take_second_half(&mut self) -> Option<RunningTrial> {
         match std::mem::replace(&mut self.trial_phase, SplatTrialPhase::Waiting) {
             SplatTrialPhase::Running(trial) if trial.is_second_half() => Some(trial),
@@ -409,7 +409,7 @@ impl SplatTrials {
         }
     }
 
-    /// Ends all trials and returns the validation keyframes, to be trained on.
+    /// Ends all trials and returns the validation keyframes, which become training keyframes.
     pub(crate) fn finish(&mut self) -> Vec<Arc<Keyframe>> {
         self.trial_phase = SplatTrialPhase::Finished;
         std::mem::take(&mut self.validation).into_iter().map(|validation| validation.keyframe).collect()
@@ -420,12 +420,12 @@ impl SplatTrials {
         self.running_trial().filter(|trial| trial.is_second_half()).map(|trial| &*trial.other)
     }
 
-    /// The splats that viewers see: during a trial, those without the change.
+    /// The splats to display. During a trial, these are the splats without the change.
     pub(crate) fn displayed<'a>(&'a self, in_training: &'a SplatBuffers) -> &'a SplatBuffers {
         self.baseline().map_or(in_training, |snapshot| &snapshot.splats)
     }
 
-    /// State for a checkpoint, except for a trial in progress.
+    /// State for a checkpoint, without the running trial.
     pub(crate) fn remaining_trials(&self) -> RemainingTrials {
         RemainingTrials {
             is_finished: !self.holds_validation(),
@@ -448,7 +448,7 @@ impl SplatTrials {
         self.trial_phase = SplatTrialPhase::Running(trial);
     }
 
-    /// Removes a candidate that was accepted without a trial. Returns whether it was a candidate.
+    /// Removes a candidate that was accepted without a trial. Returns whether it was in the list.
     pub(crate) fn remove_candidate(&mut self, found: ParamSet) -> bool {
         let n = self.candidates.len();
         self.candidates.retain(|candidate| *candidate != found);
@@ -501,7 +501,7 @@ mod tests {
     }
 
     #[test]
-    fn no_validation_images_without_candidates() {
+    fn no_trials_without_candidates() {
         let trials = SplatTrials::new(&CameraRefinement::default(), CountPolicy::ToCap);
         assert!(!trials.holds_validation() && trials.may_grow());
         assert_eq!(

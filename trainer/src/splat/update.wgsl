@@ -9,9 +9,9 @@
 // source    Kerbl et al. 2023, appendix A; Kingma and Ba 2015; noise of Kheradmand et al. 2024 (3DGS-MCMC), section 4.1;
 //           one second moment for many values as in Adam-mini (Zhang et al. 2024)
 //
-// The coefficients past the constant one share one second moment per splat and have no first moment. The squares of a
-// degree's basis functions sum to the same value in every direction, so the mean square of their gradients is
-// |v_color|^2 / (12 pi). Their learning rate is so small that the parameters themselves average over steps.
+// The higher SH coefficients of a splat share one second moment and have no first moment. The squared basis functions of
+// a degree sum to the same value in every direction, so the mean square of the gradients is |v_color|^2 / (12 pi). A
+// first moment is unnecessary because the learning rate is small: the parameters themselves average over many steps.
 
 #import view
 #import model
@@ -28,7 +28,7 @@ struct Rule {
     opacity_rate: f32,
     sh_dc_rate: f32,
     sh_rest_rate: f32,
-    noise: f32,                   // scale of the noise on means of nearly transparent splats, relative to their rate
+    noise: f32,                   // scale of the noise on the means of nearly transparent splats, relative to their learning rate
     final_mean_rate_frac: f32,    // fraction of the means' rate that remains at the end
     betas: vec2f,                 // of Adam
     epsilon: f32,                 // of Adam
@@ -100,7 +100,7 @@ fn add_sh_term(sums: ptr<function, ShSums>, k: u32, basis: f32, basis_gradient: 
     sh_rest[at + 2u * model.capacity] = updated.z;
 }
 
-// Gradient with respect to a small motion of the camera, from one splat.
+// Contribution of one splat to the gradient with respect to the camera.
 struct CameraGradient {
     rotation: vec3f,
     translation: vec3f,
@@ -119,7 +119,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     add_up_camera(lane, block, camera);
 }
 
-// Adds the gradients of a splat's intersections in their order.
+// Sums the gradients of a splat's intersections in a fixed order.
 fn gradient_of(splat_ix: u32, n_touched: u32) -> Gradient {
     var sum: Gradient;
     let begin = slot_begins[splat_ix];
@@ -235,13 +235,13 @@ fn update_splat(splat_ix: u32) -> CameraGradient {
     sh_rest_moments[splat_ix] = mean_square;
     let progress = clamp((step - rule.schedule_start) / max(rule.n_planned_steps, 1.0), 0.0, 1.0);
     let mean_rate = rule.mean_rate_m * pow(rule.final_mean_rate_frac, progress);
-    // The costs double over the plan, as the model becomes able to fit details of single images.
+    // The costs double over the planned steps, because the model later starts to overfit single images.
     let cost_gradient = (1.0 + progress) * vec4f(rule.scale_cost * p.scale, rule.opacity_cost * opacity * (1.0 - opacity));
     let mean_step = adam4(0u, splat_ix, vec4f(v_mean, 0.0));
     let rotation_step = adam4(2u, splat_ix, v_rotation);
     let shape_step = adam4(4u, splat_ix, vec4f(v_log_scale, v_opacity_logit) + cost_gradient);
 
-    // Noise moves nearly transparent splats, so that they can reach positions where they are useful.
+    // Noise moves nearly transparent splats to positions where they may be useful.
     let noise_weight = 1.0 / (1.0 + exp(100.0 * (opacity - 0.005)));
     let normal = normal3(vec3u(splat_ix, atomicLoad(&status[STEP]), rule.seed));
     let stretched = p.rotation * (p.scale * p.scale * (transpose(p.rotation) * normal));

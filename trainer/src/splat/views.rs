@@ -14,7 +14,7 @@ use keyframe::Keyframe;
 use std::collections::BTreeSet;
 use std::sync::Arc;
 
-/// Nearest and furthest distance of drawn splats from a training camera along z, meters.
+/// Near and far clipping distances of training cameras along z, meters.
 const NEAR_M: f64 = 0.01;
 pub(crate) const FAR_M: f64 = 1e4;
 
@@ -22,14 +22,14 @@ pub(crate) const FAR_M: f64 = 1e4;
 #[derive(Debug)]
 pub(crate) struct TrainView {
     pub(crate) keyframe: Arc<Keyframe>,
-    /// Median of its depth readings, if it has depth.
+    /// Median of the keyframe's depth readings, if any.
     pub(crate) median_depth_m: Option<f64>,
     levels: [Option<Level>; 3],
     /// Present once camera parameters are optimized.
     lens: Option<Buffer>,
 }
 
-/// Order in which views are trained on: all views once in a shuffled order, then again in another order.
+/// Training order of the views. Each round visits every view once, in a new random order.
 #[derive(Debug)]
 pub(crate) struct Order {
     seed: u64,
@@ -53,7 +53,7 @@ impl Order {
     }
 }
 
-/// A random order. Source: Durstenfeld 1964, with the linear congruential generator of Knuth (MMIX).
+/// Returns a random order. Source: Durstenfeld 1964, with the linear congruential generator of Knuth (MMIX).
 fn shuffled(round: u64, n_views: usize, seed: u64) -> Vec<usize> {
     let mut order: Vec<usize> = (0..n_views).collect();
     let mut state = seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) ^ round.wrapping_mul(0xd134_2543_de82_ef95);
@@ -73,7 +73,7 @@ pub(crate) struct Level {
     pub(crate) image: Buffer,
     /// Meters along z in the color camera, 0 if unknown.
     pub(crate) depth: Buffer,
-    /// Counter value at the last use, see [`drop_levels`].
+    /// Value of the request counter at the last use, for [`drop_levels`].
     used_at: u64,
 }
 
@@ -87,7 +87,7 @@ impl Level {
 /// Rules for keeping images on the GPU.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Keep<'a> {
-    /// Views and levels that the next steps need; they are always kept.
+    /// Views and levels that the next steps need. They are always kept.
     pub(crate) needed: &'a BTreeSet<(usize, usize)>,
     /// Coarsest level that is still used for training.
     pub(crate) coarsest: u32,
@@ -97,9 +97,8 @@ pub(crate) struct Keep<'a> {
 
 /// Removes images from the GPU and returns their buffers for reuse.
 ///
-/// Images at resolutions that training has passed are removed first. If the rest is still larger than `max_bytes`,
-/// the most recently used images are removed next: every view is used once per round, so the others are needed
-/// sooner.
+/// First removes images coarser than [`Keep::coarsest`]. If the rest still exceeds `max_bytes`, removes the most
+/// recently used images, because every view is used once per round and the other images are therefore needed sooner.
 pub(crate) fn drop_levels(views: &mut [TrainView], keep: Keep<'_>) -> Vec<Level> {
     let mut dropped = Vec::new();
     let mut candidates = Vec::new();
@@ -143,12 +142,12 @@ impl TrainView {
         Ok(())
     }
 
-    /// The lens, if there is one, and a level whose images are uploaded.
+    /// The lens, if any, and a level. The images of the level must be uploaded.
     pub(crate) fn ready_level(&self, level: usize) -> Result<(Option<&Buffer>, &Level), Error> {
         Ok((self.lens.as_ref(), self.levels[level].as_ref().ok_or(Error::DeviceLost)?))
     }
 
-    /// The level, limited so that no side of an image is smaller than a tile.
+    /// Returns `level`, or a finer level if a side of the image would be smaller than a tile.
     pub(crate) fn clamped(&self, level: u32) -> usize {
         let [width, height] = self.keyframe.size_px;
         level.min((width.min(height) / TILE_PX).max(1).ilog2()) as usize
@@ -169,14 +168,14 @@ impl TrainView {
         self.levels[level].is_some()
     }
 
-    /// Records that a level is used at time `now`, a counter.
+    /// Records that a level is used. `now` is the value of the request counter.
     pub(crate) fn mark_used(&mut self, level: usize, now: u64) {
         if let Some(level) = &mut self.levels[level] {
             level.used_at = now;
         }
     }
 
-    /// Uploads the images of a level, reusing the buffers of a dropped level of the same size if there is one.
+    /// Uploads the images of a level. `reused` is a dropped level of the same size whose buffers are overwritten.
     pub(crate) fn upload(
         &mut self,
         gpu: &Gpu,
@@ -201,7 +200,7 @@ impl TrainView {
                 view: gpu.uniform_with("splat.view", &view),
                 image: gpu.storage_with("splat.target_image", &images.image)?,
                 depth: match depth_bytes {
-                    // A new buffer is zeroed: no depth is known.
+                    // New buffers are zeroed, which means unknown depth.
                     [] => gpu.storage("splat.target_depth", 4 * u64::from(size_px[0]) * u64::from(size_px[1]))?,
                     _ => gpu.storage_with("splat.target_depth", depth_bytes)?,
                 },
@@ -212,7 +211,7 @@ impl TrainView {
     }
 }
 
-/// A keyframe at a lower resolution, in host memory; at full size, it shares the keyframe's pixels.
+/// A keyframe at one resolution, in host memory. At full resolution, it shares the keyframe's pixels.
 #[derive(Debug)]
 pub(crate) struct LevelImages {
     camera: Camera,
@@ -231,7 +230,7 @@ impl LevelImages {
         Self { camera, image, depth_m }
     }
 
-    /// GPU memory that the images need, bytes.
+    /// Required GPU memory of the images, bytes.
     pub(crate) fn bytes(&self) -> u64 {
         (self.image.len() + size_of_val(&*self.depth_m)) as u64
     }
@@ -256,7 +255,7 @@ pub(crate) fn camera_of(keyframe: &Keyframe) -> Camera {
     }
 }
 
-/// Means over squares of pixels; masked if any of their pixels is.
+/// Averages squares of pixels. A square is masked if any of its pixels is masked.
 fn downscaled_image(keyframe: &Keyframe, size_px: [u32; 2], level: u32) -> Arc<[u8]> {
     if level == 0 {
         return keyframe.rgba_srgb.clone();
@@ -285,8 +284,8 @@ fn downscaled_image(keyframe: &Keyframe, size_px: [u32; 2], level: u32) -> Arc<[
     downscaled.into()
 }
 
-/// Takes the value at the center of each square, because averages would create surfaces between near and far ones.
-/// Empty for a keyframe without depth.
+/// Samples the depth at the center of each square, because averages would create surfaces between near and far objects.
+/// Returns an empty array for a keyframe without depth.
 fn downscaled_depth(keyframe: &Keyframe, size_px: [u32; 2], level: u32) -> Arc<[f32]> {
     let full = depth_in_color_view(keyframe);
     if full.is_empty() || level == 0 {

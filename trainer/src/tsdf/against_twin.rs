@@ -25,7 +25,7 @@ use std::sync::Arc;
 /// Tolerance for rounding distances to 16 bits, and weights to whole 256ths, over a few images.
 const DISTANCE_QUANTA: f64 = 4.0;
 const COLOR_ABS: f64 = 5e-4;
-/// Fraction of voxels and pixels for which f32 may decide differently.
+/// Fraction of voxels and pixels for which f32 rounding may change a decision.
 const MAX_UNDECIDED_FRAC: f64 = 2e-3;
 
 fn gpu_variants() -> [GpuOptions; 2] {
@@ -242,7 +242,7 @@ fn non_finite_depth_is_ignored() {
     }
 }
 
-/// Rounding error of positions of a meter or two in f32, meters.
+/// Rounding error in f32 of positions up to about 2 m, meters.
 const POSITION_ABS_M: f64 = 1e-6;
 /// Normals are stored in 16 bits per component.
 const NORMAL_ABS: f64 = 2e-4;
@@ -254,7 +254,7 @@ fn edge_of(vertex: &Vertex) -> u32 {
     u32::try_from(3 * (81 * z + 9 * y + x)).unwrap() + u32::try_from(axis).unwrap()
 }
 
-/// Collects all differences between a block's triangles and its twin's.
+/// Records all differences between a block's triangles and its twin's.
 fn compare_triangles(mismatches: &mut Mismatches, block_coord: GridCoord, got: &BlockMesh, twin: &BlockTriangles) {
     let edges = |corners: &[u32; 3]| corners.map(|ix| got.vertices[ix as usize].edge);
     let got_edges: Vec<_> = got.triangles.iter().map(edges).collect();

@@ -70,7 +70,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     let last = vec3i(floor(end));
     let toward = sign(last - block);
     let along = end - begin;
-    // Fraction of the ray up to the next face along each axis, and between faces.
+    // Fraction of the ray up to the next face along each axis, and from one face to the next.
     let next_face = vec3f(block + max(toward, vec3i(0)));
     var reached = select(vec3f(2.0), (next_face - begin) / along, toward != vec3i(0));
     let between = select(vec3f(2.0), abs(1.0 / along), toward != vec3i(0));

@@ -7,7 +7,7 @@ use std::collections::BTreeMap;
 pub const BLOCK_EDGE: i32 = 8;
 /// Number of voxels in a block.
 pub const N_VOXELS: usize = 512;
-/// Weight of one observation from 1 m of a surface that faces the camera.
+/// Weight of one observation, from 1 m, of a surface that faces the camera.
 pub const WEIGHT_ONE: f64 = 256.0;
 
 /// Coordinates of a block in blocks, or of a voxel in voxels, relative to the field's anchor along the world's axes.
@@ -22,7 +22,7 @@ pub struct Block {
     /// Low half: signed distance as a fraction of the field's scale, times 32767; high half: weight in 256ths, 0 if not
     /// observed.
     pub geometry: Vec<u32>,
-    /// Red, green; blue and weight: 16 bits each, of 65535.
+    /// 16 bits each, low half first: red, green; blue, weight in 256ths. Colors are scaled by 65535.
     pub colors: Vec<[u32; 2]>,
 }
 

@@ -1,4 +1,4 @@
-//! Bounds of most of a distance field.
+//! Approximate bounds of a distance field.
 
 use super::block::{BLOCK_EDGE, GridCoord};
 use super::chosen_grid::VoxelGrid;

@@ -64,7 +64,7 @@ fn pool_ix_of(voxel: vec3i) -> u32 {
     return (slot - 1u) * BLOCK_VOXELS + voxel_in_block(voxel) + 1u;
 }
 
-// Distance in voxels, interpolated between eight voxel centers; UNKNOWN if one of them was not observed.
+// Distance in voxels, interpolated between eight voxel centers; UNKNOWN if any of these voxels was not observed.
 fn distance_at(point: vec3f) -> f32 {
     let corner = floor(point - 0.5);
     let share = point - 0.5 - corner;
@@ -91,7 +91,7 @@ fn distance_at(point: vec3f) -> f32 {
     return sum * field.scale_m / field.voxel_m;
 }
 
-// Color interpolated between those of eight voxels that have one; gray if none has.
+// Color interpolated between those of eight voxels that have a color; gray if none of them has.
 fn color_at(point: vec3f) -> vec3f {
     let corner = floor(point - 0.5);
     let share = point - 0.5 - corner;
@@ -176,7 +176,7 @@ fn march(ray: Ray) -> f32 {
         let word = geometry[(slot - 1u) * BLOCK_VOXELS + voxel_in_block(voxel)];
         let nearest = stored_distance(word) * field.scale_m / field.voxel_m;
         let takes_short_steps = at_m < short_steps_until_m;
-        // An unobserved voxel among the eight makes the interpolated distance unknown.
+        // The interpolated distance would be unknown, because this voxel is one of its eight.
         if stored_weight(word) == 0u {
             at_m += select(1.0, 0.25, takes_short_steps) / speed;
             continue;

@@ -15,8 +15,8 @@ const VOXEL_RANGE_M: [f64; 2] = [0.001, 0.2];
 const TRUNCATION_VOXELS: f64 = 4.0;
 /// Maximum factor by which depth noise increases the truncation.
 const MAX_TRUNCATION_FACTOR: f64 = 4.0;
-/// Fraction of `max_bytes` that one image's surface may take when the voxel size is chosen: the scene extends beyond
-/// it.
+/// Fraction of `max_bytes` that the surface in one image may take when the voxel size is chosen. The scene is larger
+/// than one image.
 const ONE_IMAGE_FRAC: f64 = 0.1;
 
 /// Voxel size and related settings of a field.
@@ -40,13 +40,13 @@ pub struct VoxelGrid {
 }
 
 impl VoxelGrid {
-    /// Chooses settings that the options leave open from the first depth image. Returns `None` if the image has no
-    /// valid readings.
+    /// Chooses the settings that the options leave open, based on the first depth image. Returns `None` if the image
+    /// has no valid readings.
     ///
-    /// The voxel size is that of a pixel at the median depth, at least the noise there, and large enough that the
-    /// surface in this image takes a tenth of `max_bytes`. Noise is the deviation of depth from a plane through its
-    /// neighbors: the 90th percentile of `|z[-1] - 2 z[0] + z[1]|` over `1.6449 sqrt(6)`. The median would be 0 for
-    /// sensors that report depth in discrete steps.
+    /// The voxel size is the size of a pixel at the median depth, but at least the noise there, and large enough that
+    /// the surface in this image takes at most a tenth of `max_bytes`. Noise is the deviation of depth from a plane
+    /// through its neighbors: the 90th percentile of `|z[-1] - 2 z[0] + z[1]|`, divided by `1.6449 sqrt(6)`. The median
+    /// would be 0 for sensors that report depth in discrete steps.
     #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a weight is clamped to 16 bits")]
     pub fn choose(options: &TsdfOptions, max_bytes: Option<u64>, depth: &DepthMap) -> Option<Self> {
         let mut depths: Vec<f64> = valid_depths(options, depth).map(|(_, z)| z).collect();

@@ -1,4 +1,4 @@
-// end_keyframe: counts the fused depth image, or stops later ones if it failed, and empties the list of visible blocks.
+// end_keyframe: counts the depth image if it was fused, else stops later ones; then empties the list of visible blocks.
 //
 // threads   one
 // writes    status

@@ -13,7 +13,7 @@ use keyframe::Keyframe;
 use std::path::Path;
 use std::sync::Arc;
 
-/// Distance fields as a method.
+/// Registry entry of distance fields.
 pub(crate) static ENTRY: MethodEntry = MethodEntry {
     name: TsdfOptions::METHOD,
     description: "signed distance field with a mesh",
@@ -60,7 +60,7 @@ fn load(gpu: Arc<Gpu>, folder: &Path) -> Result<Box<dyn Method>, Error> {
     Ok(Box::new(Aligned::load(TsdfModel::load(gpu, folder)?, folder)?))
 }
 
-/// Writes the mesh, extracted from the voxels.
+/// Extracts the mesh from the voxels and writes it.
 fn export(
     gpu: Arc<Gpu>,
     request: &ExportRequest<'_>,

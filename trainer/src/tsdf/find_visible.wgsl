@@ -1,5 +1,5 @@
-// find_visible: lists the blocks that a depth image may observe. Their order depends on thread timing, but no result
-// does: blocks are processed independently.
+// find_visible: lists the blocks that a depth image may observe. Their order depends on thread timing, but results do
+// not, because blocks are processed independently.
 //
 // threads   one per block
 // reads     field, depth_view, coords [n_blocks]

@@ -5,14 +5,14 @@
 //           visible [N_VISIBLE], status (N_VISIBLE)
 // writes    geometry, colors [n_blocks * 512], changed [n_blocks] (1 if a voxel changed)
 // twin      tsdf/reference/integrate.rs
-// source    Curless and Levoy 1996, section 3; weights: Newcombe et al. 2011 (angle; here the square of its cosine, as
-//           an error across the ray moves the surface by its tangent) and Oleynikova et al. 2017 (Voxblox: inverse
-//           square of distance, drop behind the surface). Ours: distances are measured along the surface's normal, and
-//           carving reduces the weight of a voxel instead of assigning a distance. A ray that passes through a voxel
-//           shows that nothing solid is there, but not how far away the nearest surface is.
-// software  software adapters run all lanes through a loop together, one more time if its test comes first, and through
-//           both sides of a branch. Loops are therefore tested at their end, and colors, which few voxels of a column
-//           have, are fused in a separate loop
+// source    Curless and Levoy 1996, section 3; weights: Newcombe et al. 2011 (cosine of the angle; squared here,
+//           because an error across the ray moves the surface by its tangent) and Oleynikova et al. 2017 (Voxblox:
+//           inverse square of distance, drop behind the surface). Ours: distances are measured along the surface
+//           normal, and carving reduces the weight of a voxel instead of assigning a distance. A ray through a voxel
+//           shows that the voxel is free, but not how far away the nearest surface is.
+// software  software adapters execute both sides of a branch, and run all lanes through a loop together, with an extra
+//           iteration if the test comes first. Loops are therefore tested at their end, and colors, which few voxels of
+//           a column have, are fused in a separate loop
 
 #import field
 #import field_status
@@ -32,11 +32,11 @@
 
 // Minimum cosine between ray and normal for scaling distances: normals of steeper surfaces are mostly noise.
 const MIN_RAY_DOT_NORMAL = 0.3;
-// Number of observations of a solid voxel that one observation through it cancels: if the surface behind is one
-// truncation away, and if it is two away or more. A nearer surface may be caused by a pose error.
+// Number of observations of a solid voxel that one observation through it cancels: if the surface behind the voxel is
+// one truncation away, and if it is at least two away. A nearer surface may be caused by a pose error.
 const CARVING_NEAR = 1.0;
 const CARVING_FAR = 4.0;
-// Colors are stored up to this distance from the surface, in voxels: pictures and meshes read no others.
+// Colors are stored up to this distance from the surface, in voxels. Pictures and meshes do not read other colors.
 const COLOR_VOXELS = 2.0;
 
 fn reading_at(pixel: vec2i) -> vec2f {
@@ -108,7 +108,7 @@ fn fuse(at: u32, point_in_field: vec3f) -> Fused {
     let distance_m = (reading.x - point.z) * max(reading.y, MIN_RAY_DOT_NORMAL);
     let truncation_m = truncation_at(field, reading.x);
     let ray_m = length(ray_of(depth_view, position_px));
-    // Along the ray rather than the normal: past the rim of an object, a ray soon leaves it again.
+    // Measured along the ray, not the normal: just past the rim of an object, a ray soon leaves the object again.
     let behind_m = (point.z - reading.x) * ray_m;
     if !(behind_m <= truncation_m) { return UNCHANGED; } // Hidden.
     let nearness = min(1.0, 1.0 / (reading.x * reading.x));
@@ -118,8 +118,8 @@ fn fuse(at: u32, point_in_field: vec3f) -> Fused {
     let old = geometry[at];
     let weight = stored_weight(old);
     if distance_m > truncation_m {
-        // Carving only reduces the weight of solid voxels. The accuracy depends on the position of the voxel, not on
-        // the surface behind it.
+        // Carving only reduces the weight of solid voxels. Its accuracy depends on the depth of the voxel, not on the
+        // surface behind it.
         if weight == 0u || stored_distance(old) >= 0.0 { return UNCHANGED; }
         let carving = mix(CARVING_NEAR, CARVING_FAR, min(distance_m / truncation_m - 1.0, 1.0));
         let weight_loss = u32(max(floor(carving * WEIGHT_ONE * min(1.0, 1.0 / (point.z * point.z)) + 0.5), 1.0));
@@ -148,8 +148,8 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
         let begin = slot * BLOCK_VOXELS + lane;
         let first = coords[slot].xyz * 8 + vec3i(vec3u(lane & 7u, lane >> 3u, 0u));
         var any_changed = false;
-        var stale = 0u;         // Bit z: the color of this voxel must be fused;
-        var gains = vec2u(0u); // byte z: the weight it gains, minus one.
+        var stale = 0u;         // Bit z: the color of voxel z must be fused.
+        var gains = vec2u(0u); // Byte z: the color weight that voxel z gains, minus one.
         var z = 0u;
         loop {
             let fused = fuse(begin + z * 64u, center_of(first, z));

@@ -1,7 +1,7 @@
-// list_stale: lists the blocks whose triangles may have changed: blocks that changed and all neighbors, whose cubes and
-// normals read their voxels. The order depends on thread timing; blocks are processed independently.
+// list_stale: lists the blocks whose triangles may have changed: changed blocks and all their neighbors, whose cubes
+// and normals read the changed voxels. The order depends on thread timing; blocks are processed independently.
 //
-// groups    one per block of the pool; 32 threads, 27 of them for the block or a neighbor each
+// groups    one per block of the pool; 32 threads, 27 of which handle the block and its neighbors
 // reads     field, status, coords, changed, keys, entries
 // writes    is_stale [n_block_slots] (all 0 before), stale [1 + n_stale] (count, 0 before; then slots)
 // twin      none: mesh/tests.rs compares an incrementally updated mesh with one built at once

@@ -1,12 +1,12 @@
-// march_cubes: the triangles of the cubes whose lowest corner is in a block, for each block of a batch. Cubes with an
-// unobserved corner have none.
+// march_cubes: extracts the triangles of the cubes whose lowest corner is in a block, for each block of a batch. Cubes
+// with an unobserved corner have no triangles.
 //
 // groups    one per block; 256 threads, two cubes each
 // reads     field, batch, coords, keys, entries, geometry, colors, stale [1 + n_stale] (count, then slots), cases [256
-//           * 6] (number of triangles, then each one's edges, five bits each: corner, axis)
+//           * 6] (number of triangles; then, per triangle, three edges of five bits each: corner, axis)
 // writes    needed (required capacity), parts [max_blocks], vertices, triangles [3 each] (counterclockwise when viewed
-//           from outside; indices into `vertices`). The position of a block's triangles depends on thread timing, their
-//           order does not; a block that does not fit writes none.
+//           from outside; indices into `vertices`). The position of a block's triangles depends on thread timing, but
+//           their order does not. A block that does not fit writes no triangles.
 // twin      tsdf/reference/march.rs
 // source    Lorensen and Cline 1987; ours: a block's range is allocated by one atomic addition after a scan within the
 //           block
@@ -31,7 +31,7 @@
 @group(0) @binding(11) var<storage, read_write> vertices: array<MeshVertex>;
 @group(0) @binding(12) var<storage, read_write> triangles: array<u32>;
 
-// Voxels that a block's vertices and normals read: one before it and two behind, along each axis.
+// Voxels that the vertices and normals of a block read: one before the block and two after it, along each axis.
 const TILE_VOXELS = 1331u;
 const TILE_STEPS = vec3u(1u, 11u, 121u);
 // Edges of the block's cubes, nine voxels along each axis, and the words that hold one bit per edge.
@@ -41,10 +41,10 @@ const USED_WORDS = 69u;
 const CASE_WORDS = 6u;
 const GRAY = vec3f(0.5);
 
-var<workgroup> wg_slots: array<u32, 27>;           // plus one, of the neighboring blocks
+var<workgroup> wg_slots: array<u32, 27>;           // slots plus one of the block and its neighbors
 var<workgroup> wg_words: array<u32, TILE_VOXELS>;
 var<workgroup> wg_used: array<atomic<u32>, USED_WORDS>;
-var<workgroup> wg_before: array<u32, USED_WORDS>;  // Number of vertices in the words before.
+var<workgroup> wg_before: array<u32, USED_WORDS>;  // Number of vertices in preceding words.
 var<workgroup> wg_edges: array<u32, CUBE_EDGES>;   // edges that have a vertex, in order
 var<workgroup> wg_begin: vec2u;                    // Where the block's vertices and triangles are written.
 
@@ -52,12 +52,12 @@ fn corner_of(corner: u32) -> vec3u {
     return vec3u(corner & 1u, (corner >> 1u) & 1u, corner >> 2u);
 }
 
-// Index in the tile of a voxel of the block or its surroundings, from -1 on.
+// Index in the tile of a voxel of the block or its surroundings; coordinates start at -1.
 fn tile_ix(voxel: vec3u) -> u32 {
     return dot(voxel + 1u, TILE_STEPS);
 }
 
-// Bit c of a cube's case: corner c is inside; 0 if any corner was not observed.
+// Case of a cube: bit c is set if corner c is inside. 0 if any corner was not observed.
 fn case_of(cube: vec3u) -> u32 {
     let first = tile_ix(cube);
     var inside = 0u;
@@ -65,12 +65,12 @@ fn case_of(cube: vec3u) -> u32 {
     for (var corner = 0u; corner < 8u; corner++) {
         let word = wg_words[first + dot(corner_of(corner), TILE_STEPS)];
         is_observed = is_observed && stored_weight(word) != 0u;
-        inside |= ((word >> 15u) & 1u) << corner; // The distance's sign.
+        inside |= ((word >> 15u) & 1u) << corner; // Sign of the distance.
     }
     return select(0u, inside, is_observed);
 }
 
-// Index of a triangle's edge among those of all the block's cubes.
+// Index of the edge at a triangle's corner, among the edges of all cubes of the block.
 fn edge_of(cube: vec3u, codes: u32, corner: u32) -> u32 {
     let code = (codes >> (5u * corner)) & 31u;
     return dot(cube + corner_of(code & 7u), EDGE_STEPS) + (code >> 3u);
@@ -162,7 +162,7 @@ fn vertex_of(block: vec3i, edge: u32) -> MeshVertex {
     let normal = select(vec3f(along) * sign(there - here), gradient / gradient_norm, gradient_norm > 1e-12);
     let near = color_at(voxel);
     let far = color_at(voxel + along);
-    // If only one of them has a color, use that one.
+    // If only one of the voxels has a color, use that color.
     let only = select(vec4f(GRAY, 1.0), near + far, near.a + far.a > 0.0);
     let rgba = select(only, mix(near, far, share), near.a * far.a > 0.0);
     return MeshVertex(array(position_m.x, position_m.y, position_m.z), edge, octahedral(normal), pack4x8unorm(rgba));

@@ -10,9 +10,9 @@ use crate::gpu::{Buffer, Gpu};
 pub(crate) struct MeshCapacity {
     /// Maximum number of blocks per dispatch; a field's list may be longer.
     pub(crate) n_blocks: u32,
-    /// Initial capacity; grown to the needs of a batch.
+    /// Initial capacity, which grows to fit a batch.
     pub(crate) n_vertices: u32,
-    /// Initial capacity; grown to the needs of a batch.
+    /// Initial capacity, which grows to fit a batch.
     pub(crate) n_triangles: u32,
 }
 
@@ -63,7 +63,7 @@ impl MeshBuffers {
     }
 }
 
-/// The 256 cases in the format of the kernel: number of triangles, and three edges of each in five bits: corner, axis.
+/// The 256 cases in the format of the kernel: number of triangles; then three edges per triangle, five bits each.
 fn case_words() -> Vec<u32> {
     CASES
         .iter()

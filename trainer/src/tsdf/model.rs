@@ -38,8 +38,8 @@ use std::path::Path;
 use std::sync::Arc;
 use std::time::Instant;
 
-/// Minimum number of blocks that the budget must allow: the voxel size is chosen so that one image takes a tenth of
-/// them.
+/// Minimum number of blocks that the budget must allow. The voxel size is chosen so that one image takes a tenth of the
+/// budget.
 const MIN_BLOCKS: u32 = 256;
 /// Minimum budget: the initial table and the minimum number of blocks.
 pub(super) const MIN_BYTES: u64 =
@@ -103,7 +103,7 @@ impl TsdfModel {
         self.queue.n_skipped
     }
 
-    /// Number of readings whose surface was too far out for block coordinates.
+    /// Number of readings whose surface is outside the range of block coordinates.
     pub fn n_outside(&self) -> u32 {
         self.fusion.n_outside
     }
@@ -125,7 +125,7 @@ impl TsdfModel {
         Ok(self.voxel_grid().map_or_else(Mesh::default, |voxel_grid| self.meshing.mesh(voxel_grid)))
     }
 
-    /// Meshes the blocks that changed since the last call and reads their triangles back, without joining them to one
+    /// Meshes the blocks that changed since the last call and reads their triangles back, without joining them into one
     /// mesh. Returns the number of blocks.
     pub fn update_mesh(&mut self) -> Result<usize, Error> {
         self.finish_in_flight()?;
@@ -133,8 +133,8 @@ impl TsdfModel {
         self.meshing.update(&self.gpu, &self.pipelines, store)
     }
 
-    /// GPU time of meshing the blocks that changed since the last [`Self::update_mesh`]. They stay marked as changed,
-    /// and nothing is read back. Empty if the adapter has no timestamps, or if blocks are in host memory.
+    /// GPU time of meshing the blocks that changed since the last [`Self::update_mesh`]. The blocks stay marked as
+    /// changed, and nothing is read back. Empty if the adapter has no timestamps, or if blocks are in host memory.
     pub fn profile_mesh(&mut self) -> Result<Vec<PassTiming>, Error> {
         self.finish_in_flight()?;
         match self.store.as_ref().filter(|store| store.host_blocks.is_empty()) {
@@ -146,7 +146,7 @@ impl TsdfModel {
     /// Chooses the voxel size from the first depth image with valid readings and discards earlier ones. Returns whether
     /// there was one.
     fn begin(&mut self) -> Result<bool, Error> {
-        // The size of one binding limits the field like a budget does.
+        // The maximum size of a binding limits the field, just like a budget.
         let max_blocks =
             capacity::max_blocks_within(&self.gpu, self.options.common.max_bytes, INITIAL_CAPACITY.n_chunks);
         let max_bytes = Some(u64::from(max_blocks) * BYTES_PER_BLOCK);
@@ -160,8 +160,8 @@ impl TsdfModel {
         Ok(!self.queue.pending.is_empty())
     }
 
-    /// Fuses one keyframe if none was fused yet, so that there is something to render. It fuses no more, so that
-    /// rendering does not train.
+    /// Fuses one keyframe if none was fused yet, so that there is something to render. Fuses only one, because
+    /// rendering must not train the model.
     fn fuse_one(&mut self) -> Result<(), Error> {
         while self.queue.step() == 0 && !self.queue.pending.is_empty() {
             self.step(1)?;
@@ -182,7 +182,7 @@ impl TsdfModel {
         }
         if !self.load_blocks_of_first()? {
             self.skip_first();
-            return Ok(1); // The next image needs other blocks.
+            return Ok(1); // The next image needs different blocks.
         }
         self.record(0, 0)?;
         self.passes.submit(&self.gpu);
@@ -265,8 +265,8 @@ impl Method for TsdfModel {
         Ok(())
     }
 
-    /// Removes a keyframe that was not fused yet. Fused keyframes stay, because their contribution to the sums is
-    /// unknown; they fade as later keyframes observe the same place.
+    /// Removes a keyframe that was not fused yet. The contribution of fused keyframes stays, because it is not stored
+    /// separately; it fades as later keyframes observe the same place.
     fn remove(&mut self, camera: &str, stamp: Stamp) -> Result<(), Error> {
         self.finish_in_flight()?;
         self.queue.remove(camera, stamp);
@@ -301,7 +301,7 @@ impl Method for TsdfModel {
         let failed = self.finish_in_flight()?; // Waits for the previous submit while this one runs.
         if !failed {
             self.fusion.submits.begin(counters, n_keyframes as u64, since);
-        } // Otherwise the new submit found the failure too and did nothing.
+        } // After a failure, the new submit had no effect.
         if n_keyframes as u64 == n_asked || n_keyframes as u64 == n_left {
             self.finish_in_flight()?; // The caller expects a correct count.
         }

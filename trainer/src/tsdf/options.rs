@@ -3,8 +3,8 @@
 use crate::model_options::MethodOptions;
 use serde::{Deserialize, Serialize};
 
-/// Options of a [`super::TsdfModel`], besides those that all methods share. Of the latter it uses the maximum number of
-/// bytes and the alignment; nothing is random.
+/// Options specific to a [`super::TsdfModel`]. Of the common options, only the maximum number of bytes and the
+/// alignment are used; nothing is random.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TsdfOptions {

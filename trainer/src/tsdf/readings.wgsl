@@ -1,9 +1,9 @@
-// readings: which pixels of a depth image are valid, and the orientation of their surface.
+// readings: determines the valid pixels of a depth image, and the orientation of their surface.
 //
 // threads   one per pixel of the depth image
 // reads     field, depth_view, depth [n_pixels] (bits of meters along z)
-// writes    readings [n_pixels]: depth in meters, 0 for invalid pixels; and the ray with z = 1 times the surface's unit
-//           normal, which converts a difference in z to a distance along the normal
+// writes    readings [n_pixels]: depth in meters, 0 for invalid pixels; and the dot product of the ray (z = 1) and the
+//           unit surface normal, which converts a difference in z to a distance along the normal
 // twin      tsdf/reference/readings.rs
 // source    normals by differences: Newcombe et al. 2011 (KinectFusion), section 3.2; the slope limit, and wider
 //           differences on flat surfaces, are ours
@@ -20,9 +20,9 @@
 const MIN_DEPTH_M = 0.01;
 // Wide differences for normals use pixels this far apart on each side, to reduce noise.
 const WIDE_STEP = 3;
-// Largest second difference of depths on a flat surface, in units of noise: 2.45 standard deviations.
+// Maximum second difference of depths on a flat surface, in units of the noise: 2.45 standard deviations.
 const MAX_FLAT_NOISES = 6.0;
-// Steepest valid surface, as change of depth over lateral distance: steeper ones are edges.
+// Maximum slope of a valid surface: change of depth over lateral distance. Steeper surfaces count as edges.
 const MAX_SLOPE = 6.0;
 
 // Depth of a pixel; 0 if invalid. Finiteness is tested on the bits: the compiler may assume there is no NaN.

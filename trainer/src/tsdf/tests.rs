@@ -92,13 +92,13 @@ fn removed_object_is_carved() {
     let mut model = fused_model(scenes::options(), &keyframes);
     let n_after = near_ball(&mut model);
     assert!(n_before > 500 && n_after * 50 < n_before, "{n_after} of {n_before} vertices of the ball remain");
-    // The floor is still there.
+    // The floor must remain.
     let picture = model.render(&scenes::request(view_of(&keyframes[0]))).unwrap();
     assert!(picture.depth_m.iter().filter(|depth| **depth > 0.0).count() > 5000);
 }
 
 /// Observes a ball `n_with` times, then observes the scene without it until its mesh is gone. Returns the number of
-/// those later observations: for its upper part, and for the part within five voxels of the floor.
+/// later observations until the upper part was gone, and until the part within five voxels of the floor was gone.
 fn n_views_until_removed(n_with: usize) -> [usize; 2] {
     const MAX_VIEWS: usize = 200;
     let [with_ball, without_ball] = [&[scenes::ball(BALL_CENTER), scenes::floor()][..], &[scenes::floor()]]
@@ -176,7 +176,7 @@ fn keyframes_without_depth_are_ignored() {
 fn back_faces_are_not_drawn() {
     let keyframes = ball_on_floor(4);
     let mut model = fused_model(scenes::options(), &keyframes);
-    // Just below the floor's surface, looking up and along: the back of the floor must not be rendered.
+    // Just below the floor's surface, looking up and forward: the back of the floor must not be rendered.
     let eye = Point3::new(BALL_CENTER.x, BALL_CENTER.y - 0.5, -0.33);
     let picture = model.render(&scenes::request(scenes::look_at(eye, eye + Vector3::new(0.0, 0.3, 1.0)))).unwrap();
     let nearest = picture.depth_m.iter().copied().filter(|depth| *depth > 0.0).fold(f32::INFINITY, f32::min);
@@ -311,14 +311,14 @@ fn swapping_to_host_memory_is_lossless() {
         assert!(same(&limited.render(&request).unwrap(), &unlimited.render(&request).unwrap()));
     }
     assert!(limited.mesh().unwrap() == unlimited.mesh().unwrap());
-    // Less than one image needs: images are skipped and counted.
+    // A budget that is too small for one image: images are skipped and counted.
     let mut too_small = model_with_budget(20_000);
     assert_eq!((too_small.n_skipped(), too_small.progress().step), (8, 8));
     assert!(too_small.render(&scenes::request(view_of(&keyframes[0]))).is_ok());
 }
 
 #[test]
-fn memory_budget_is_kept_or_refused() {
+fn memory_budget_is_kept_or_rejected() {
     let min_bytes = super::model::MIN_BYTES;
     let of =
         |max_bytes| ModelOptions::<TsdfOptions>::default().with(|options| options.common.max_bytes = Some(max_bytes));

@@ -1,4 +1,4 @@
-//! Moves blocks between the pool on the GPU and host memory, and to pools of other sizes.
+//! Moves blocks between the GPU pool and host memory, and to pools of other sizes.
 
 use super::block::{Block, Blocks, GridCoord, N_VOXELS};
 use super::buffers::FieldBuffers;
@@ -15,8 +15,8 @@ use std::collections::BTreeSet;
 const GATHER_BATCH: usize = 2048;
 
 impl FieldBuffers {
-    /// A copy of the field with another capacity. Forgets blocks that were requested but did not fit, so that their
-    /// depth images can be fused again.
+    /// Copies the field to buffers of another capacity. Drops requests for blocks that did not fit, so that their depth
+    /// images can be fused again.
     pub(crate) fn resized(
         &self,
         gpu: &Gpu,

@@ -63,14 +63,14 @@ impl Camera {
         }
     }
 
-    /// The same camera with an image smaller by `2^level`; leftover rows and columns at the far edges are cropped.
+    /// The same camera with an image smaller by `2^level`. Leftover rows and columns at the far edges are cropped.
     pub(crate) fn at_level(&self, level: u32) -> Self {
         let share = 0.5f64.powi(i32::try_from(level).expect("a few levels"));
         Self {
             size_px: self.size_px.map(|size| (size >> level).max(1)),
             focal_px: self.focal_px.map(|focal| focal * share),
             principal_px: self.principal_px.map(|principal| principal * share),
-            low_pass_px2: self.low_pass_px2 * share * share, // Keeps the width in the world constant.
+            low_pass_px2: self.low_pass_px2 * share * share, // Keeps the filter width in the world constant.
             ..self.clone()
         }
     }

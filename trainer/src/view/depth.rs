@@ -14,7 +14,7 @@ use std::sync::Arc;
 /// Median of the depth of a keyframe, meters; `None` without depth.
 pub(crate) fn median_depth_m(keyframe: &Keyframe) -> Option<f64> {
     let depth = keyframe.depth.as_ref()?;
-    // Samples all columns and rows, with a sufficient number of pixels from small images.
+    // A prime stride samples all columns and rows. Small images use a shorter stride, to get enough samples.
     let step = 997.min(depth.depth_m.len() / 64).max(1);
     let sample = depth.depth_m.iter().copied().step_by(step).filter(|z| *z > 0.0);
     quantile(&mut sample.map(f64::from).collect::<Vec<_>>(), 0.5, Rank::Upper)
@@ -22,7 +22,7 @@ pub(crate) fn median_depth_m(keyframe: &Keyframe) -> Option<f64> {
 
 /// Depth along the color camera's z axis for each of its pixels; empty if the keyframe has no depth.
 ///
-/// Depth from a camera with another lens, pose or time is reprojected point by point; the nearest point is used.
+/// Depth from a camera with another lens, pose or time is reprojected point by point. The nearest point wins.
 pub(crate) fn depth_in_color_view(keyframe: &Keyframe) -> Arc<[f32]> {
     let Some(depth) = &keyframe.depth else { return [].into() };
     let same_lens = depth.size_px == keyframe.size_px

@@ -1,4 +1,4 @@
-//! Views that all methods share: cameras, projections of pictures, and depth as the color camera sees it.
+//! View code that all methods share: cameras, picture projections, and depth in the color camera's view.
 
 mod camera;
 mod depth;

@@ -10,7 +10,7 @@ use kinematics::Transform;
 use nalgebra::{Rotation3, UnitQuaternion, Vector3};
 use std::f64::consts::{FRAC_PI_2, PI};
 
-/// Renders the request with `draw`, which draws pinhole cameras, with depth if the request includes it.
+/// Renders a request with `draw`, which renders one pinhole picture. Depth is rendered only if requested.
 pub(crate) fn render(
     request: &RenderRequest,
     mut draw: impl FnMut(&Camera) -> Result<Picture, Error>,

@@ -153,7 +153,7 @@ impl NerfModel {
         Ok(())
     }
 
-    /// During a trial, saves the state from before the trial, which restarts when resumed.
+    /// During a trial, saves the state from before the trial. The trial restarts after resuming.
     pub(super) fn take_checkpoint(&mut self) -> Result<PendingCheckpoint, Error> {
         self.finish_in_flight()?;
         let (gpu, mut state) = (self.gpu.clone(), self.state()?);
@@ -204,8 +204,8 @@ impl NerfModel {
         Ok((model, state))
     }
 
-    /// Resumes training from a checkpoint as if it had not stopped. `keyframes` must include all that the model was
-    /// trained on. Returns the others, to be pushed or kept for testing.
+    /// Resumes training exactly where the checkpoint was taken. `keyframes` must include all that the model was trained
+    /// on. Also returns the other keyframes, to be pushed or kept for testing.
     pub fn resume(
         gpu: Arc<Gpu>,
         checkpoint: &Checkpoint,

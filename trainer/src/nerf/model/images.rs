@@ -1,10 +1,10 @@
-//! Image parameters optimized with the field: pose corrections and appearance embeddings (light and exposure). Trials
-//! decide which of them are kept, and interpolation predicts them for images without training.
+//! Image parameters optimized with the field: pose corrections and appearance embeddings (lighting and exposure).
+//! Trials decide which of them are kept. For images that were not trained on, the parameters are interpolated.
 //!
-//! From a fixed step on, candidates are tried one after the other, unless a quick check shows no gain. The field is
+//! From a fixed step on, candidates are tried one after another, unless a quick check shows no gain. The field is
 //! trained for some steps with the candidate, restored, and trained for as many steps without it. The candidate is kept
-//! if it improves the prediction of validation images, whose parameters are interpolated from training images before
-//! and after them in time.
+//! if it improves the prediction of validation images. The parameters of validation images are interpolated from the
+//! training images before and after them in time.
 
 use super::NerfModel;
 use crate::Error;
@@ -38,7 +38,7 @@ const VALIDATION_SEED: u64 = 0x6a75_6467;
 pub(super) struct FieldSnapshot {
     pub(super) arrays: Vec<Array>,
     pub(super) step: u64,
-    /// Number of images whose hints the field has.
+    /// Number of images whose hints were applied to the field.
     pub(super) n_hinted: usize,
     pub(super) learned_params: ParamSet,
 }
@@ -46,7 +46,7 @@ pub(super) struct FieldSnapshot {
 /// Trials of image parameters.
 #[derive(Debug, Default)]
 pub(super) struct Trials {
-    /// Candidates in the order of their trials; the first is the one on trial.
+    /// Candidates in the order of their trials. The first one is on trial.
     remaining: VecDeque<ParamSet>,
     pub(super) finished: Vec<TrialReport>,
     running: Option<RunningTrial>,
@@ -60,7 +60,7 @@ struct RunningTrial {
     variant: Option<(FieldSnapshot, Vec<f64>)>,
 }
 
-/// The subset of calibration parameters that a field can optimize.
+/// The camera parameters in a set that a field can optimize.
 pub(super) fn image_params_of_set(set: ParamSet) -> ParamSet {
     set & (ParamSet::IMAGE_POSES | ParamSet::IMAGE_GAINS)
 }
@@ -83,7 +83,7 @@ impl Trials {
         self.remaining.is_empty()
     }
 
-    /// During a trial, the field from before it.
+    /// The field before the running trial; `None` if there is none.
     pub(super) fn before(&self) -> Option<&FieldSnapshot> {
         self.running.as_ref().map(|trial| &trial.before)
     }
@@ -114,7 +114,7 @@ impl NerfModel {
         self.next_trial_step().map_or(u64::MAX, |at| at.saturating_sub(self.step).max(1))
     }
 
-    /// Starts a trial, switches to its baseline, or decides it, if due.
+    /// When due, starts a trial, switches it to the baseline, or concludes it.
     pub(super) fn advance_trials_when_due(&mut self) -> Result<(), Error> {
         while self.next_trial_step().is_some_and(|at| self.step >= at) {
             self.finish_in_flight()?;
@@ -168,7 +168,7 @@ impl NerfModel {
         }
     }
 
-    /// Ends all trials. Needed when the field is recreated or loses an image: snapshots then no longer match it.
+    /// Ends all trials. Needed when the field is recreated or loses an image, because snapshots then do not match it.
     pub(super) fn abort_trials(&mut self) -> Result<(), Error> {
         let Some(before) = self.trials.before() else { return Ok(()) };
         self.learned_params = before.learned_params;
@@ -188,8 +188,8 @@ impl NerfModel {
     }
 
     /// Estimates the gain of a candidate without training it, and returns the result if the gain is not significant.
-    /// For appearance: scales pictures by gains interpolated from training images, and checks whether that brings them
-    /// closer to the validation images.
+    /// For appearance, checks whether scaling pictures by gains interpolated from training images brings them closer to
+    /// the validation images.
     fn rule_out(&mut self, candidate: ParamSet) -> Result<Option<Trial>, Error> {
         if !candidate.contains(ParamSet::IMAGE_GAINS) {
             return Ok(None);
@@ -264,7 +264,7 @@ impl NerfModel {
         let Some((extent, field_trainer)) = &self.field else { return Ok(BTreeMap::new()) };
         let image_params = field_trainer.image_param_values(&self.gpu, self.images.len())?;
         let mut corrections: BTreeMap<String, CameraCorrection> = BTreeMap::new();
-        // Later images are not part of the field yet and have no parameters.
+        // Later images are not part of the field yet, so they have no parameters.
         for (image, image_params) in self.images.iter().zip(&image_params).take(self.n_hinted) {
             let correction = corrections.entry(image.keyframe.camera.to_string()).or_default();
             if self.learned_params.contains(ParamSet::IMAGE_POSES) {
@@ -303,8 +303,8 @@ impl NerfModel {
         Ok(())
     }
 
-    /// Appearance embedding of a camera's image at some time, interpolated from those before and after it. Falls back
-    /// to the mean of all.
+    /// Appearance embedding for a camera and stamp, interpolated between the images before and after it. Falls back to
+    /// the mean of all embeddings.
     pub(super) fn embedding_of(&mut self, image: Option<&(Arc<str>, Stamp)>) -> Result<[f64; EMBEDDING_DIM], Error> {
         let corrections = self.camera_corrections()?;
         let embedding_of_image = image

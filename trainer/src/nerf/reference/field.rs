@@ -8,10 +8,10 @@ use super::space::{contract, contract_backward};
 pub const N_GEOMETRY_FEATURES: usize = 15;
 /// Basis functions of the direction: spherical harmonics up to degree 3.
 pub const N_DIRECTION: usize = 16;
-/// Upper limit of the logarithm of the density, so that no density is infinite.
+/// Upper limit of the logarithm of the density, to keep densities finite.
 pub const MAX_LOG_DENSITY: f64 = 12.0;
 
-/// Added to the network's log density. Keeps an untrained field thin.
+/// Added to the network's log density. Sets the density of an untrained field.
 pub const LOG_DENSITY_BIAS: f64 = 0.0;
 
 /// All parameters of a field.
@@ -84,8 +84,8 @@ impl Field {
         Point { density, rgb, contracted, density_layers, color_layers }
     }
 
-    /// Backpropagates gradients of density and color. Adds those of the parameters to the field's gradient; returns
-    /// those of the point and of the appearance embedding.
+    /// Backpropagates gradients of density and color. Adds the parameter gradients to `gradient`; returns the gradients
+    /// of the point and of the appearance embedding.
     pub fn point_backward(
         &self,
         at: [f64; 3],

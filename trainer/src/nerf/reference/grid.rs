@@ -22,7 +22,7 @@ impl GridShape {
         Self { n_cells: (0..n_levels).map(n_cells).collect(), log2_entries }
     }
 
-    /// Entries of a level.
+    /// Number of entries of a level.
     pub fn n_entries(&self, level: usize) -> u32 {
         let max_entries = 1u64 << self.log2_entries;
         let n_corners = (u64::from(self.n_cells[level]) + 1).pow(3);
@@ -34,7 +34,7 @@ impl GridShape {
         (0..level).map(|level| self.n_entries(level)).sum()
     }
 
-    /// Entries of all levels.
+    /// Number of entries of all levels.
     pub fn n_entries_total(&self) -> u32 {
         self.begin(self.n_cells.len())
     }
@@ -63,7 +63,7 @@ impl GridShape {
 struct Corner {
     entry: usize,
     weight: f64,
-    /// Gradient of the weight with respect to the point, which is in units of the cube.
+    /// Gradient of the weight with respect to the point, in units of the cube.
     weight_gradient: [f64; 3],
 }
 
@@ -99,7 +99,7 @@ pub fn interpolate(shape: &GridShape, table: &[[f64; N_FEATURES]], at: [f64; 3])
     features
 }
 
-/// Backpropagates gradients of the features. Adds those of the table to it; returns the gradient of the point.
+/// Backpropagates gradients of the features. Adds the entry gradients to `v_table`; returns the gradient of the point.
 pub fn interpolate_backward(
     shape: &GridShape,
     table: &[[f64; N_FEATURES]],

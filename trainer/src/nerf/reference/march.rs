@@ -1,6 +1,6 @@
 //! Walks a ray through the occupied parts of the scene.
 //!
-//! Source: occupancy of Mueller et al. 2022, appendix C; steps grow outside the inner cube as contraction shrinks them.
+//! Source: occupancy of Mueller et al. 2022, appendix C; steps outside the inner cube grow to match the contraction.
 
 use super::space::contract;
 
@@ -24,7 +24,7 @@ pub struct RaySegment {
     pub length: f64,
 }
 
-/// Components of a direction smaller than this are replaced by it.
+/// Components of a direction that are smaller than this are replaced by it.
 const MIN_DIRECTION: f64 = 1e-9;
 
 /// The part of a ray inside the inner cube, and its number of steps.
@@ -62,9 +62,9 @@ impl March {
         (cell[0] + self.n_cells * (cell[1] + self.n_cells * cell[2]), margin)
     }
 
-    /// All segments of a ray between two distances that are in occupied cells; the steps are offset by `jitter` steps
-    /// from `range[0]`. Also returns a margin: the smallest distance to a cell's side, in cells, or of the number of
-    /// steps to an integer.
+    /// All segments of a ray that are within a range of distances and in occupied cells. The first step starts `jitter`
+    /// steps after `range[0]`. Also returns a margin: the smallest distance of a segment's middle to a cell's side, in
+    /// cells, or of the number of steps to an integer.
     ///
     /// Steps have constant length inside the inner cube. Outside, the step at a distance u from the cube is longer by
     /// (1 + u)^2, so that each step changes 1 / (1 + u) by the same amount.
@@ -121,7 +121,7 @@ impl March {
         path
     }
 
-    /// The spans of the samples selected from the segments: at most `max_samples`, each representing the same number of
+    /// The spans of the samples selected from the segments: at most `max_samples`. Each represents the same number of
     /// segments.
     pub fn spans(&self, segments: &[RaySegment], jitter: f64) -> Vec<[f64; 2]> {
         let stride = segments.len().div_ceil(self.max_samples).max(1);

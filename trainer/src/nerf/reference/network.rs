@@ -1,4 +1,4 @@
-//! A small fully connected network without biases: hidden layers have a `ReLU`, the last one does not.
+//! A small fully connected network without biases. Hidden layers have a `ReLU`; the last layer has none.
 
 /// Weights of a network.
 #[derive(Clone, Debug, PartialEq)]
@@ -32,7 +32,7 @@ impl Network {
         layers
     }
 
-    /// Backpropagates gradients of the output. Adds those of the weights to `v_weights`; returns the gradient of the
+    /// Backpropagates gradients of the output. Adds the weight gradients to `v_weights`; returns the gradient of the
     /// input.
     pub fn backward(&self, layers: &[Vec<f64>], upstream: &[f64], v_weights: &mut [f64]) -> Vec<f64> {
         let mut v_out = upstream.to_vec();

@@ -18,8 +18,8 @@ impl ImagePose {
         ((Vector3::from(origin) + Vector3::from(self.translation)).into(), (rotation * Vector3::from(direction)).into())
     }
 
-    /// Gradients with respect to a small additional rotation and translation of a ray, from those of the positions of
-    /// its samples.
+    /// Gradients with respect to a small additional rotation and translation of a ray, computed from the gradients of
+    /// its sample positions.
     ///
     /// * `direction`: corrected direction of the ray, of length 1.
     /// * `sample_positions`: distance along the ray and gradient of each sample.

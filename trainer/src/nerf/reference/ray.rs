@@ -69,7 +69,7 @@ pub fn composite_backward(samples: &[Sample], rendered: &RenderedRay, upstream: 
         let color: f64 = (0..3).map(|channel| upstream.rgb[channel] * samples[ix].rgb[channel]).sum();
         color + upstream.distance * samples[ix].middle() + upstream.weights[ix]
     };
-    // A sample takes light from all samples behind it.
+    // A sample occludes all samples behind it.
     let mut behind = rendered.transmittance * upstream.transmittance;
     let mut gradients = Vec::with_capacity(samples.len());
     for ix in (0..samples.len()).rev() {
@@ -85,11 +85,11 @@ pub fn composite_backward(samples: &[Sample], rendered: &RenderedRay, upstream: 
     gradients
 }
 
-/// Distortion loss: spread of the weights along a ray, and the gradient with respect to each of them. Zero if all
-/// weight is at one position.
+/// Distortion loss: spread of the weights along a ray. Also returns its gradient with respect to each weight. Zero if
+/// all weight is at one position.
 ///
-/// Distances count as `near / t`, so that spread far away costs less. Source: Barron et al. 2022, equation 15, summed in one
-/// pass as in Sun et al. 2022.
+/// Distances are normalized to `1 - near / t`, so that spread far away costs less. Source: Barron et al. 2022, equation
+/// 15, summed in one pass as in Sun et al. 2022.
 pub fn distortion(samples: &[Sample], weights: &[f64], near: f64) -> (f64, Vec<f64>) {
     let normalized_distance = |t: f64| 1.0 - near / t.max(near);
     let middles: Vec<f64> = samples
@@ -116,7 +116,7 @@ pub fn distortion(samples: &[Sample], weights: &[f64], near: f64) -> (f64, Vec<f
     (loss, gradients)
 }
 
-/// Color and distance that an image shows for a ray.
+/// Observed color and distance of a ray.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Target {
     /// 0 to 1.
@@ -130,15 +130,15 @@ pub struct Target {
 pub struct Weights {
     /// Weight of the distance, per unit.
     pub distance_weight: f64,
-    /// Differences of distance beyond this have no gradient.
+    /// Distance residuals beyond this have no gradient.
     pub distance_clip: f64,
     /// Weight of the distortion.
     pub distortion: f64,
-    /// Near end of the distances compared by the distortion loss.
+    /// Minimum distance in the distortion loss.
     pub near: f64,
     /// Weight of the line-of-sight loss, which penalizes opacity away from the measured depth.
     pub line_of_sight: f64,
-    /// Opacity this close to the measured distance is allowed: a fraction of the distance, and an offset added to it.
+    /// Opacity within this band around the measured distance is allowed: a fraction of the distance, plus an offset.
     pub band: [f64; 2],
     /// Color behind everything.
     pub background_rgb: [f64; 3],
@@ -146,9 +146,9 @@ pub struct Weights {
 
 /// Loss of one ray, and its gradients.
 ///
-/// Where the distance is known, opacity should be there and nowhere else (line of sight: Rematas et al. 2022, equations
-/// 9 to 12, with a band in place of a bell). Some opacity elsewhere remains possible, for example of glass, which a
-/// depth camera sees through.
+/// If the distance is known, opacity is rewarded there and penalized elsewhere (line of sight: Rematas et al. 2022,
+/// equations 9 to 12, with a band instead of a bell curve). Some opacity elsewhere remains possible, for example for
+/// glass, which depth cameras do not measure.
 pub fn loss(samples: &[Sample], rendered: &RenderedRay, target: &Target, weights: &Weights) -> (f64, Upstream) {
     let (distortion_loss, v_weights) = distortion(samples, &rendered.weights, weights.near);
     let mut upstream = Upstream {

@@ -1,4 +1,4 @@
-//! Gradients against central differences, and each part against its definition.
+//! Tests of gradients against central differences, and of each part against its definition.
 
 use super::field::Field;
 use super::grid::{self, GridShape};

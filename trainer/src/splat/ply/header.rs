@@ -1,6 +1,6 @@
 //! The header and tables of a binary `.ply` file. Source: Turk, "The PLY Polygon File Format", 1994.
 
-/// Maximum length of a header; those of splats have about two thousand bytes.
+/// Maximum length of a header. Headers of splat files have about 2000 bytes.
 const MAX_HEADER_BYTES: usize = 64 * 1024;
 
 /// The tables of a file.
@@ -177,7 +177,7 @@ impl Column<'_> {
     pub(super) fn bits(&self, row: usize) -> Result<u32, String> {
         match self.property.number_type {
             NumberType::U32 => Ok(u32::from_le_bytes(self.bytes(row))),
-            other => Err(format!("property {:?} is {other:?}, expected uint", self.property.name)),
+            other => Err(format!("property {:?} has type {other:?}, expected uint", self.property.name)),
         }
     }
 

@@ -10,14 +10,14 @@ use header::{Column, Header, Table};
 use std::io::{BufWriter, Write};
 use std::path::Path;
 
-/// Reads a `.ply` file of splats. Properties may have any order and number type; their count determines the degree of
-/// the spherical harmonics.
+/// Reads a `.ply` file of splats. Properties may have any order and number type. The number of `f_rest_*` properties
+/// determines the SH degree.
 pub fn read(path: &Path) -> Result<SplatArrays, Error> {
     let bytes = std::fs::read(path).map_err(|source| Error::Read { path: path.to_owned(), source })?;
     from_bytes(&bytes).map_err(|reason| Error::SplatFile { path: path.to_owned(), reason })?.checked()
 }
 
-/// Writes a `.ply` file of splats, little endian, f32. After a failed write, no partial file has this name.
+/// Writes a `.ply` file of splats as little-endian f32. A failed write leaves no partial file at `path`.
 pub fn write(path: &Path, splats: &SplatArrays) -> Result<(), Error> {
     atomic_file::write(path, |file| {
         let mut file = BufWriter::new(file);
@@ -48,7 +48,7 @@ fn from_bytes(bytes: &[u8]) -> Result<SplatArrays, String> {
     })
 }
 
-/// The columns of the color coefficients; files store the higher ones of red first, then green, then blue.
+/// The columns of the color coefficients. Files store all higher coefficients of red, then of green, then of blue.
 struct ColorColumns<'a> {
     degree: u32,
     constant: [Column<'a>; 3],
@@ -69,7 +69,7 @@ impl<'a> ColorColumns<'a> {
     }
 }
 
-/// Degree of the spherical harmonics and the columns `f_rest_*`.
+/// SH degree and the columns `f_rest_*`.
 fn rest_columns<'a>(table: &Table<'a>) -> Result<(u32, Vec<Column<'a>>), String> {
     let rest: Vec<_> = (0..).map_while(|ix| table.column(&format!("f_rest_{ix}")).ok()).collect();
     let degree = match rest.len() {
@@ -77,7 +77,7 @@ fn rest_columns<'a>(table: &Table<'a>) -> Result<(u32, Vec<Column<'a>>), String>
         9 => 1,
         24 => 2,
         45 => 3,
-        other => return Err(format!("{other} properties f_rest_*, expected 0, 9, 24 or 45")),
+        other => return Err(format!("found {other} f_rest_* properties, expected 0, 9, 24 or 45")),
     };
     Ok((degree, rest))
 }

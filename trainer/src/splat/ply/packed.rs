@@ -1,5 +1,5 @@
-//! The packed `.ply` of `SuperSplat`: 16 bytes per splat in chunks of 256 with common bounds; higher color coefficients
-//! have 8 bits each.
+//! The packed `.ply` layout of `SuperSplat`. A splat takes 16 bytes; each chunk of 256 splats has common bounds. Higher
+//! color coefficients have 8 bits each.
 
 use super::header::{Column, Header, Table};
 use super::rest_columns;
@@ -8,9 +8,9 @@ use crate::splat::arrays::SplatArrays;
 const SPLATS_PER_CHUNK: usize = 256;
 /// Constant factor of the first spherical harmonic, `1 / (2 sqrt(pi))`.
 const SH_0: f32 = 0.282_094_8;
-/// The higher color coefficients span -4 to 4.
+/// Size of the range of the higher color coefficients, -4 to 4.
 const REST_SPAN: f32 = 8.0;
-/// Opacities of 0 and 255 would have infinite logits; they are moved inside by half a step.
+/// Half a step. Opacities stay at least this far from 0 and 1, where the logit is infinite.
 const MIN_OPACITY: f32 = 0.5 / 255.0;
 
 /// Unpacks the splats of a file.
@@ -53,7 +53,7 @@ pub(super) fn splats(header: &Header, bytes: &[u8]) -> Result<SplatArrays, Strin
 struct Bounds<'a> {
     position: PropertyRange<'a>,
     log_scale: PropertyRange<'a>,
-    /// Older files have none: color then spans 0 to 1.
+    /// `None` in older files, in which colors span 0 to 1.
     color: Option<PropertyRange<'a>>,
 }
 
@@ -77,7 +77,7 @@ impl<'a> Bounds<'a> {
     }
 }
 
-/// Minimum and maximum of three properties of each chunk.
+/// Minimum and maximum of three properties in each chunk.
 struct PropertyRange<'a> {
     min: [Column<'a>; 3],
     max: [Column<'a>; 3],
@@ -92,18 +92,19 @@ impl PropertyRange<'_> {
     }
 }
 
-/// Three fractions from 11, 10 and 11 bits, the first in the highest bits.
+/// Unpacks three fractions of 11, 10 and 11 bits, beginning at the highest bits.
 fn three_fractions(bits: u32) -> [f32; 3] {
     [frac(bits >> 21, 11), frac(bits >> 11, 10), frac(bits, 11)]
 }
 
-/// The lowest `n_bits` bits, scaled to 0 to 1.
+/// The lowest `n_bits` bits, scaled to the range 0 to 1.
 fn frac(bits: u32, n_bits: u32) -> f32 {
     let largest = (1_u32 << n_bits) - 1;
     (bits & largest) as f32 / largest as f32
 }
 
-/// Two bits select the largest of w x y z, which is positive; the other three follow in 10 bits each.
+/// Unpacks a quaternion. The highest two bits select its largest component, which is positive and not stored. The other
+/// three have 10 bits each.
 fn rotation_wxyz(bits: u32) -> [f32; 4] {
     let largest_ix = (bits >> 30) as usize;
     let others = [20, 10, 0].map(|shift| (frac(bits >> shift, 10) - 0.5) * std::f32::consts::SQRT_2);
@@ -115,7 +116,7 @@ fn rotation_wxyz(bits: u32) -> [f32; 4] {
     wxyz
 }
 
-/// A higher color coefficient from its byte: the ends are exact, other values are the center of their step.
+/// Decodes a higher color coefficient. Bytes 0 and 255 are the ends of the range, other bytes the center of a step.
 fn higher_coefficient(byte: f32) -> f32 {
     let frac = match byte {
         0.0 => 0.0,

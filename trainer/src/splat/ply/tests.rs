@@ -3,7 +3,7 @@
 use super::*;
 use crate::splat::cloud::synthetic_cloud;
 
-/// The first splats of a cloud, with fewer color coefficients.
+/// A cloud of five splats of this SH degree.
 fn cloud_of_degree(sh_degree: u32) -> SplatArrays {
     let cloud = synthetic_cloud(5, 1);
     let n_kept = (sh_degree as usize + 1).pow(2);
@@ -34,7 +34,7 @@ fn layout_matches_other_programs() {
     let header = Header::parse(&file).unwrap();
     let table = header.table("vertex", &file).unwrap();
     let at = |name: &str| table.column(name).unwrap().f32(0);
-    // The higher coefficients of red come first, three of them at degree 1.
+    // All higher coefficients of red come first: three at degree 1.
     assert_eq!([at("f_rest_0"), at("f_rest_3"), at("f_rest_6")], [11.0, 12.0, 13.0]);
     assert_eq!([at("rot_0"), at("rot_3")], [cloud.rotations_wxyz[0][0], cloud.rotations_wxyz[0][3]]);
     assert!(file.starts_with(b"ply\nformat binary_little_endian 1.0\nelement vertex 5\nproperty float x\n"));

@@ -1,7 +1,7 @@
 //! Plain CPU version of the kernels that change splats: the optimizer step (update.wgsl) and growth (grow_*.wgsl).
 //!
-//! Source: Kingma and Ba 2015; Kheradmand et al. 2024 (3DGS-MCMC), sections 4.1 and 4.2; error instead of opacity as
-//! the measure for growth after Bulo et al. 2024.
+//! Source: Kingma and Ba 2015; Kheradmand et al. 2024 (3DGS-MCMC), sections 4.1 and 4.2. Parents are chosen by error
+//! instead of opacity, as in Bulo et al. 2024.
 
 use super::random::{normal3, uniform3};
 use super::{Splat, SplatGrad};
@@ -9,8 +9,8 @@ use crate::optim::reference::{Adam, Moments};
 use crate::splat::params::{Growth, Rule};
 use nalgebra::{Quaternion, UnitQuaternion, Vector3};
 
-/// Adam's moments of every value of one splat, in the order of [`values`]. Colors past the constant one share one
-/// second moment.
+/// Adam's moments of every value of one splat, in the order of [`values`]. The higher SH coefficients share one second
+/// moment.
 pub(crate) type SplatMoments = Vec<Moments>;
 
 /// Mean, log scale, rotation, opacity logit, then the color coefficients.
@@ -24,7 +24,7 @@ fn sigmoid(x: f64) -> f64 {
     1.0 / (1.0 + (-x).exp())
 }
 
-/// Takes one optimizer step for one splat; `step` counts from 0.
+/// Takes one optimizer step for one splat. `step` counts from 0.
 pub(crate) fn update(
     splat: &Splat,
     gradient: &SplatGrad,
@@ -85,18 +85,19 @@ pub(crate) fn update(
     }
 }
 
-/// Larger families are treated as this large.
+/// Maximum family size. Larger families are treated as if they had this size.
 const MAX_FAMILY: u32 = 16;
 
-/// Splats after a change of their number, and the parent of each new one.
+/// Splats after a change of the splat count, and the parent of each new splat.
 pub(crate) struct Grown {
     pub(crate) splats: Vec<Splat>,
     pub(crate) parents: Vec<Option<usize>>,
-    /// Smallest distance of a choice from selecting another parent, as a fraction of the total error.
+    /// Smallest change of a random threshold that would select another parent, as a fraction of the total error.
     pub(crate) margin: f64,
 }
 
-/// Gives each dead or new splat a parent, chosen by error, a position within it, and a share of its opacity.
+/// Replaces dead splats and creates new ones as children of parents that are chosen by error. A child gets a position
+/// within its parent and a share of its parent's opacity.
 pub(crate) fn grow(splats: &[Splat], errors: &[f64], growth: &Growth) -> Grown {
     let is_dead = |splat: &Splat| sigmoid(splat.opacity_logit) < f64::from(growth.min_opacity);
     let mut cumulative = Vec::with_capacity(splats.len());
@@ -141,7 +142,7 @@ pub(crate) fn grow(splats: &[Splat], errors: &[f64], growth: &Growth) -> Grown {
     Grown { splats: grown, parents, margin }
 }
 
-/// Sets the opacity and size of one of `n` splats that together look like the original one.
+/// Sets the opacity and size of one of `n` splats so that together they look like the original splat.
 fn share_opacity(splat: &mut Splat, n: u32) {
     let opacity = sigmoid(splat.opacity_logit).clamp(1e-4, 0.9999);
     let shared = (1.0 - (1.0 - opacity).powf(1.0 / f64::from(n))).clamp(0.005, 0.9999);

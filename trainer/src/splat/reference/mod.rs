@@ -1,11 +1,11 @@
-//! Plain CPU version of splatting in f64, with which every kernel of `splat` is compared.
+//! Plain CPU version of splatting in f64. Tests compare every kernel of `splat` with it.
 //!
 //! `project` projects each splat onto the image plane, and `rasterize` composites the splats pixel by pixel; each has
-//! a backward function. All decisions by comparison (visibility, depth order, contributors of each pixel) are made
-//! once, in [`decide`], and kept fixed while gradients are computed.
+//! a backward function. Discrete decisions (visibility, depth order, contributors of each pixel) are made once, in
+//! [`decide`], and kept fixed while gradients are computed.
 //!
-//! Source: Kerbl et al. 2023 (3D Gaussian splatting) and Ye et al. 2024 (gsplat, appendix on gradients). We differ in
-//! the rolling shutter, and in a depth output that is composited like a color.
+//! Source: Kerbl et al. 2023 (3D Gaussian splatting) and Ye et al. 2024 (gsplat, appendix on gradients). We add a
+//! rolling shutter and a depth output, which is composited like a color.
 
 #[cfg(test)]
 pub(crate) mod change;
@@ -31,9 +31,9 @@ pub use rasterize::{Decisions, decide};
 pub struct Splat {
     /// Center in the world, meters.
     pub mean: [f64; 3],
-    /// Natural logarithms of the standard deviations along the splat's own axes, which are in meters.
+    /// Natural logarithms of the standard deviations in meters along the splat's own axes.
     pub log_scale: [f64; 3],
-    /// `world_from_splat` rotation; any nonzero length, normalized on use.
+    /// Rotation `world_from_splat`. It may have any nonzero length and is normalized on use.
     pub rotation_wxyz: [f64; 4],
     /// Opacity before the sigmoid.
     pub opacity_logit: f64,
@@ -47,7 +47,7 @@ pub type SplatGrad = Splat;
 /// One camera at one time, with its motion during readout.
 #[derive(Clone, Debug, PartialEq)]
 pub struct View {
-    /// Pose at the middle row's exposure.
+    /// Pose at the exposure of the middle row.
     pub camera_from_world: Transform,
     /// Focal length, pixels.
     pub focal_px: [f64; 2],
@@ -57,9 +57,9 @@ pub struct View {
     pub size_px: [u32; 2],
     /// Splats nearer than this along z are not drawn, meters.
     pub near_m: f64,
-    /// Translation of the camera over the whole readout in its own axes, meters: linear velocity times readout time.
+    /// Translation of the camera during the whole readout in its own axes, meters: linear velocity times readout time.
     pub linear_m: [f64; 3],
-    /// Rotation of the camera over the whole readout in its own axes, radians: angular velocity times readout time.
+    /// Rotation of the camera during the whole readout in its own axes, radians: angular velocity times readout time.
     pub angular_rad: [f64; 3],
 }
 
@@ -101,7 +101,7 @@ pub struct Projected {
     pub color: [f64; 3],
     /// Depth of the center along the camera's z axis, meters.
     pub depth: f64,
-    /// Half sides of the bounding box around `mean_px`, outside which the splat contributes nothing, pixels.
+    /// Half width and height of the bounding box around `mean_px`, pixels. The splat contributes nothing outside of it.
     pub extent_px: [f64; 2],
 }
 
@@ -110,7 +110,7 @@ pub struct Projected {
 pub struct ProjectedGrad {
     /// With respect to the center.
     pub mean_px: [f64; 2],
-    /// With respect to the three numbers of the conic; `b` represents both off-diagonal entries.
+    /// With respect to the three numbers of the conic. `b` represents both off-diagonal entries.
     pub conic: [f64; 3],
     /// With respect to the opacity.
     pub opacity: f64,
@@ -136,12 +136,12 @@ pub fn render(view: &View, splats: &[Splat]) -> RenderedImage {
     render_decided(view, splats, &decide(view, splats))
 }
 
-/// Renders the splats with given decisions, so that finite differences do not change them.
+/// Renders the splats with fixed decisions, as finite differences require.
 pub fn render_decided(view: &View, splats: &[Splat], decisions: &Decisions) -> RenderedImage {
     rasterize::composite(view, &project_decided(view, splats, decisions), decisions)
 }
 
-/// Gradient of a loss with respect to every splat and the view, from its gradient with respect to the image.
+/// Gradient of a loss with respect to every splat and the view, given its gradient with respect to the image.
 pub fn render_backward(view: &View, splats: &[Splat], upstream: &Upstream) -> RenderGrad {
     let decisions = decide(view, splats);
     let projected = project_decided(view, splats, &decisions);

@@ -1,7 +1,7 @@
 //! Projection of one splat onto the image plane, and its gradient.
 //!
-//! Source: Zwicker et al. 2001 (EWA splatting); the clamp of the Jacobian is that of gsplat (Ye et al. 2024). A
-//! rolling shutter moves the splat by its row's share of the readout; the gradient treats this share as constant.
+//! Source: Zwicker et al. 2001 (EWA splatting). The Jacobian is clamped as in gsplat (Ye et al. 2024). With a rolling
+//! shutter, a splat's position depends on the time at which its row is read. The gradient treats this time as constant.
 
 use super::{Projected, ProjectedGrad, Splat, SplatGrad, View, ViewGrad};
 use crate::spherical_harmonics as sh;
@@ -9,24 +9,24 @@ use nalgebra::{Matrix2, Matrix2x3, Matrix3, Vector2, Vector3};
 
 /// Minimum alpha that is drawn.
 pub const MIN_ALPHA: f64 = 1.0 / 255.0;
-/// Added to both variances on the image plane so that no splat falls between pixels, square pixels.
+/// Added to both variances on the image plane, in square pixels, so that no splat falls between pixels.
 pub const BLUR_PX2: f64 = 0.3;
-/// The ratios in the Jacobian are clamped beyond this fraction of half the image outside its border.
+/// Margin around the image beyond which the Jacobian is clamped, as a fraction of half the image size.
 const MARGIN_FRAC: f64 = 0.3;
 
 /// Projects a splat; `None` if it is nearer than `near_m` or too transparent to draw.
 ///
-/// Splats outside the image are projected, too; they do not contribute to any pixel.
+/// Splats outside the image are also projected, but do not contribute to any pixel.
 pub fn project(view: &View, splat: &Splat) -> Option<Projected> {
     let projected = project_at(view, splat, row_share(view, splat));
-    // Written so that a splat with a NaN is invisible.
+    // These comparisons are false for NaN, so a splat with a NaN is invisible.
     (projected.depth >= view.near_m && projected.opacity >= MIN_ALPHA).then_some(projected)
 }
 
 /// Time at which the splat's row is read, as a share of the readout: -0.5 for the first row, 0.5 for the last.
 ///
-/// The row is determined with the camera's pose at the middle row, without motion. The share is 0 for a splat that is
-/// not in front of that camera.
+/// The row is determined with the camera's pose at the middle row, without motion. The share is 0 for splats that are
+/// nearer than `near_m` in that pose.
 pub fn row_share(view: &View, splat: &Splat) -> f64 {
     let point_in_camera = view.camera_from_world * nalgebra::Point3::from(splat.mean);
     if point_in_camera.z < view.near_m {
@@ -54,7 +54,7 @@ pub fn project_at(view: &View, splat: &Splat, row_share: f64) -> Projected {
     }
 }
 
-/// Gradient with respect to the splat's raw values and the view, from the gradient with respect to the projected
+/// Gradient with respect to the splat's raw values and the view, given the gradient with respect to the projected
 /// splat.
 pub fn project_backward(view: &View, splat: &Splat, row_share: f64, v: &ProjectedGrad) -> (SplatGrad, ViewGrad) {
     let parts = Parts::new(view, splat, row_share);
@@ -63,7 +63,7 @@ pub fn project_backward(view: &View, splat: &Splat, row_share: f64, v: &Projecte
     let (v_sh, v_offset) = sh::color_backward(&splat.sh, &offset_in_world(view, splat), &v.color);
     let opacity = sigmoid(splat.opacity_logit);
 
-    // From the conic to the map from the splat's axes to the image.
+    // From the conic to the log scale and the rotation.
     let v_conic = Matrix2::new(v.conic[0], 0.5 * v.conic[1], 0.5 * v.conic[1], v.conic[2]);
     let v_cov = -parts.conic * v_conic * parts.conic;
     let v_image_from_world = 2.0 * v_cov * parts.image_from_world * parts.cov_in_world;
@@ -72,7 +72,7 @@ pub fn project_backward(view: &View, splat: &Splat, row_share: f64, v: &Projecte
     let v_cov_in_world = parts.image_from_world.transpose() * v_cov * parts.image_from_world;
     let (v_log_scale, v_rotation_wxyz) = shape_backward(splat, &v_cov_in_world);
 
-    // From the image to the point in the camera frame at the splat's row, then at the middle row.
+    // From the image to the point in the camera frame, first at the splat's row, then at the middle row.
     let mut v_point =
         pinhole_backward(view, &parts.point_in_camera, &v.mean_px) + jacobian_backward(view, &parts, &v_jacobian);
     v_point.z += v.depth;
@@ -107,7 +107,7 @@ struct Parts {
     still_point: Vector3<f64>,
     /// Center in the camera frame when the splat's row is read.
     point_in_camera: Vector3<f64>,
-    /// Linear part of the camera's motion between the two.
+    /// Linear part of the transform from `still_point` to `point_in_camera`.
     moved_from_still: Matrix3<f64>,
     /// Linear part of the transform from the world to the moved camera.
     moved_from_world: Matrix3<f64>,
@@ -160,7 +160,7 @@ impl Parts {
     }
 }
 
-/// Clamps the ratio x/z (axis 0) or y/z (axis 1) to the image plus a margin; returns whether that changed it.
+/// Clamps the ratio x/z (axis 0) or y/z (axis 1) to the image plus a margin. Also returns whether the ratio changed.
 fn clamped_ratio(view: &View, axis: usize, ratio: f64) -> (f64, bool) {
     let (focal_px, principal_px, size_px) =
         (view.focal_px[axis], view.principal_px[axis], f64::from(view.size_px[axis]));
@@ -170,16 +170,16 @@ fn clamped_ratio(view: &View, axis: usize, ratio: f64) -> (f64, bool) {
     (ratio.clamp(lowest, highest), ratio < lowest || ratio > highest)
 }
 
-/// From the gradient with respect to the center in pixels to that with respect to the point in the camera frame.
+/// Propagates the gradient from the center in pixels to the point in the camera frame.
 fn pinhole_backward(view: &View, point: &Vector3<f64>, v_mean_px: &[f64; 2]) -> Vector3<f64> {
     let per_z = Vector2::new(view.focal_px[0] * v_mean_px[0], view.focal_px[1] * v_mean_px[1]) / point.z;
     Vector3::new(per_z.x, per_z.y, -(per_z.x * point.x + per_z.y * point.y) / point.z)
 }
 
-/// From the gradient with respect to the pinhole's Jacobian to that with respect to the point in the camera frame.
+/// Propagates the gradient from the Jacobian of the projection to the point in the camera frame.
 ///
-/// Row `axis` of the Jacobian is `f / z` on the diagonal and `-f * ratio / z` in the last column, where `ratio` is
-/// `point / z` inside the clamp and constant outside.
+/// Row `axis` of the Jacobian is `f / z` on the diagonal and `-f * ratio / z` in the last column. `ratio` is
+/// `point / z`, or a constant if it is clamped.
 fn jacobian_backward(view: &View, parts: &Parts, v_jacobian: &Matrix2x3<f64>) -> Vector3<f64> {
     let z = parts.point_in_camera.z;
     let mut v_point = Vector3::zeros();
@@ -196,8 +196,7 @@ fn jacobian_backward(view: &View, parts: &Parts, v_jacobian: &Matrix2x3<f64>) ->
     v_point
 }
 
-/// From the gradient with respect to the covariance in the world to that with respect to log scale and raw
-/// quaternion.
+/// Propagates the gradient from the covariance in the world to the log scale and the raw quaternion.
 fn shape_backward(splat: &Splat, v_cov: &Matrix3<f64>) -> ([f64; 3], [f64; 4]) {
     let unit_wxyz = unit(&splat.rotation_wxyz);
     let rotation = rotation_matrix(&unit_wxyz);
@@ -225,7 +224,7 @@ fn rotation_matrix(&[w, x, y, z]: &[f64; 4]) -> Matrix3<f64> {
     )
 }
 
-/// Gradient of [`rotation_matrix`] with respect to its four numbers as free variables.
+/// Propagates the gradient from [`rotation_matrix`] to the quaternion, whose components are treated as independent.
 fn rotation_matrix_backward(&[w, x, y, z]: &[f64; 4], v: &Matrix3<f64>) -> [f64; 4] {
     let even = |row, column| v[(row, column)] + v[(column, row)];
     let odd = |row, column| v[(row, column)] - v[(column, row)];
@@ -237,7 +236,7 @@ fn rotation_matrix_backward(&[w, x, y, z]: &[f64; 4], v: &Matrix3<f64>) -> [f64;
     ]
 }
 
-/// Gradient with respect to a vector `a` from the gradient with respect to its cross-product matrix.
+/// Propagates the gradient from a cross-product matrix to its vector.
 fn by_rotation(v: &Matrix3<f64>) -> Vector3<f64> {
     Vector3::new(v[(2, 1)] - v[(1, 2)], v[(0, 2)] - v[(2, 0)], v[(1, 0)] - v[(0, 1)])
 }

@@ -6,8 +6,8 @@ use kinematics::Transform;
 use nalgebra::Vector3;
 use safetensors::SafeTensors;
 
-/// The picture was computed in f32; its largest differences are a quarter of these tolerances. A different decision
-/// at a splat's edge (alpha 1/255) would differ by a thousand times as much.
+/// The published picture was computed in f32. The largest difference is a quarter of these tolerances. A different
+/// decision at a splat's edge (alpha 1/255) would cause a difference a thousand times as large.
 const ABS: f64 = 2e-6;
 const REL: f64 = 1e-5;
 

@@ -54,7 +54,7 @@ pub fn composite(view: &View, projected: &[Projected], decisions: &Decisions) ->
     image
 }
 
-/// Gradient of a loss with respect to each projected splat, from its gradient with respect to the image.
+/// Gradient of a loss with respect to each projected splat, given its gradient with respect to the image.
 pub fn composite_backward(
     view: &View,
     projected: &[Projected],
@@ -88,11 +88,11 @@ pub fn composite_backward(
     grads
 }
 
-/// Relative distance of each pixel's decisions from their thresholds.
+/// Smallest relative distance of each pixel's decisions from their thresholds.
 ///
-/// The distance is the smallest of: any alpha to [`MIN_ALPHA`] or [`MAX_ALPHA`], any transmittance to
-/// [`MIN_TRANSMITTANCE`], and the depths of consecutive splats to each other unless they are equal. Arithmetic with
-/// rounding errors larger than this may decide differently.
+/// Compares all alphas with [`MIN_ALPHA`] and [`MAX_ALPHA`], all transmittances with [`MIN_TRANSMITTANCE`], and the
+/// depths of consecutive splats with each other unless they are equal. Arithmetic with larger rounding errors may
+/// decide differently.
 pub fn threshold_margins(view: &View, splats: &[Splat]) -> Vec<f64> {
     let projected: Vec<_> = splats.iter().map(|splat| project(view, splat)).collect();
     let front_to_back = front_to_back(&projected);
@@ -156,7 +156,7 @@ fn contributors(front_to_back: &[(usize, Projected)], center_px: &[f64; 2]) -> V
 
 /// Coverage of one pixel by one splat.
 struct Coverage {
-    /// Vector from the pixel's center to the splat's, pixels.
+    /// Vector from the center of the pixel to the center of the splat, pixels.
     offset_px: [f64; 2],
     /// Half the squared distance in standard deviations.
     sigma: f64,
@@ -179,12 +179,12 @@ impl Coverage {
         self.unclamped.min(MAX_ALPHA)
     }
 
-    /// Whether the splat contributes. A conic that is not positive definite, due to rounding, is not drawn.
+    /// Whether the splat contributes. Splats whose conic is not positive definite due to rounding are not drawn.
     fn is_drawn(&self) -> bool {
         self.sigma >= 0.0 && self.alpha() >= MIN_ALPHA
     }
 
-    /// Adds the gradient with respect to center, conic and opacity, which is zero if alpha is clamped.
+    /// Adds the gradient with respect to center, conic and opacity. It is zero if alpha is clamped.
     fn backward(&self, splat: &Projected, v_alpha: f64, grad: &mut ProjectedGrad) {
         if self.unclamped > MAX_ALPHA {
             return;

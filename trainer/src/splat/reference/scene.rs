@@ -8,8 +8,8 @@ use nalgebra::{Point3, Vector3};
 /// Number of spherical-harmonic coefficients for degrees 0 to 3.
 pub(crate) const N_COEFFS: [usize; 4] = [1, 4, 9, 16];
 
-/// A static camera that is off-axis, rotated about all axes, with unequal focal lengths and an off-center principal
-/// point, so that no term of a gradient is zero. It looks at the world's origin from 2 m away.
+/// A static camera that looks at the world's origin from 2 m away. It is rotated about all axes and has unequal focal
+/// lengths and an off-center principal point, so that no gradient term is zero.
 pub(crate) fn tilted_view() -> View {
     let world_from_camera = Transform::face_towards(
         &Point3::new(1.1, -1.5, 0.8),
@@ -65,7 +65,7 @@ pub(crate) fn some_upstream(seed: u64, view: &View) -> Upstream {
 }
 
 impl Upstream {
-    /// The loss that is linear in the image and has this gradient.
+    /// A loss that is linear in the image. Its gradient is `self`.
     pub(crate) fn dot(&self, image: &RenderedImage) -> f64 {
         let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
         dot(self.rgb.as_flattened(), image.rgb.as_flattened())

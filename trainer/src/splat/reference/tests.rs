@@ -7,12 +7,12 @@ use super::*;
 use crate::mismatches::Mismatches;
 
 const NUDGE: f64 = 1e-5;
-/// Rounding error of a loss of a few tens, divided by the nudge.
+/// Rounding error of the loss (a few tens), divided by the nudge.
 const ABS: f64 = 2e-8;
 /// Truncation error: the nudge squared times third derivatives, which are large for small sharp splats.
 const REL: f64 = 1e-6;
 
-/// Compares every gradient of a render with central differences; decisions are kept fixed.
+/// Compares every gradient of a render with central differences at fixed decisions.
 fn check_gradients(view: &View, splats: &[Splat], mismatches: &mut Mismatches) {
     let upstream = some_upstream(7, view);
     let decisions = decide(view, splats);
@@ -99,14 +99,14 @@ fn gradients_match_central_differences_at_clamps() {
     let clamped = view.pixel_centers().zip(decide(&view, &splats).contributors).filter(|(center_px, contributors)| {
         contributors.contains(&3) && center_of_3.opacity * (-sigma(&center_of_3, center_px)).exp() > MAX_ALPHA
     });
-    assert!(clamped.count() > 0, "no pixel reaches the bound of alpha");
+    assert!(clamped.count() > 0, "no pixel reaches the maximum alpha");
     for outside in [0, 2] {
         assert!(grad.splats[outside].mean.iter().all(|v| v.abs() > 1e-6), "a splat outside the image has a gradient");
     }
 }
 
-/// A large splat outside the image whose Jacobian is clamped along x, another one for y, one with a channel far below
-/// 0, one almost opaque whose alpha is clamped at some pixels, two at the same position, and some more.
+/// Splats that exercise all clamps. Splats 0 and 2 are outside the image, where the Jacobian is clamped along x or y.
+/// Splat 1 has a channel far below 0. Splat 3 has a clamped alpha at some pixels. Splats 4 and 5 have equal positions.
 fn clamped_scene(view: &View) -> Vec<Splat> {
     let world_from_camera = view.camera_from_world.inverse();
     let in_world = |x, y, z| (world_from_camera * nalgebra::Point3::new(x, y, z)).coords.into();
@@ -118,7 +118,7 @@ fn clamped_scene(view: &View) -> Vec<Splat> {
     splats[2].mean = in_world(-0.02 * z, -0.75 * z, z); // The image ends at y/z = -0.37, the clamp at -0.48.
     splats[2].log_scale = [-0.5, -0.7, -0.6];
     splats[3].opacity_logit = 20.0;
-    splats[3].log_scale = [0.0; 3]; // Wide enough that alpha exceeds its bound at a pixel.
+    splats[3].log_scale = [0.0; 3]; // Wide enough to exceed the maximum alpha at a pixel.
     splats[3].mean = in_world(0.02, 0.03, 2.4); // Behind the others.
     splats[5].mean = splats[4].mean;
     splats
@@ -152,7 +152,7 @@ fn wrong_gradient_is_detected() {
 
 #[test]
 fn each_parameter_has_a_gradient() {
-    // Otherwise the comparison above would compare zeros.
+    // Otherwise, the comparisons with central differences would compare zeros.
     let view = rolling_view();
     let grad = render_backward(&view, &small_scene(4, 12), &some_upstream(7, &view));
     let visible: Vec<_> = grad.splats.iter().filter(|splat| splat.opacity_logit != 0.0).collect();
@@ -165,12 +165,12 @@ fn each_parameter_has_a_gradient() {
 }
 
 #[test]
-fn static_camera_ignores_readout_time() {
+fn rolling_shutter_leaves_the_middle_row_in_place() {
     let splats = small_scene(2, 8);
     let still = render(&tilted_view(), &splats);
     let moving = render(&rolling_view(), &splats);
     assert_ne!(still.rgb, moving.rgb);
-    // At the middle row, a moving camera has the same view as a static one.
+    // At the middle row, the moving camera has the pose of the static camera.
     let view = View { angular_rad: [0.0; 3], ..rolling_view() };
     for splat in &splats {
         assert_eq!(project_at(&view, splat, 0.0).mean_px, project_at(&tilted_view(), splat, 0.0).mean_px);
@@ -178,10 +178,10 @@ fn static_camera_ignores_readout_time() {
 }
 
 #[test]
-fn rolling_shutter_follows_the_camera_of_each_row() {
+fn rolling_shutter_matches_the_exact_pose_of_each_row() {
     // Compares the reference's first-order motion with the exact pose at the splat's own row.
     let view = View { linear_m: [2e-3, -1e-3, 3e-3], angular_rad: [1e-3, -2e-3, 2e-3], ..tilted_view() };
-    const ABS_PX: f64 = 1e-3; // Second order of the motion: (2e-3)^2 times 31 px, and 0.1 px for the row's own shift.
+    const ABS_PX: f64 = 1e-3; // Second-order errors: (2e-3)^2 times 31 px, and a shift of the row by 0.1 px.
     let mut mismatches = Mismatches::default();
     for (ix, splat) in small_scene(2, 8).iter().enumerate() {
         let share = row_share(&view, splat);
@@ -203,7 +203,7 @@ fn rolling_shutter_follows_the_camera_of_each_row() {
 
 #[test]
 fn ratios_beyond_the_margin_are_clamped_only_in_covariance() {
-    // A round splat 2 m away from a camera at the world's origin: its covariance follows analytically from the
+    // For a round splat 2 m in front of a camera at the world's origin, the covariance is an analytic function of the
     // ratios.
     let view = View { camera_from_world: Transform::identity(), ..tilted_view() };
     let scale_px: [f64; 2] = [0.1 * 31.0 / 2.0, 0.1 * 28.0 / 2.0];
@@ -214,7 +214,7 @@ fn ratios_beyond_the_margin_are_clamped_only_in_covariance() {
         opacity_logit: 3.0,
         sh: vec![[0.0; 3]],
     };
-    // The margin is 0.15 of the image's side: to the right (28 - 13.3 + 4.2) / 31, upwards (10.4 + 3) / 28.
+    // The margin is 0.15 of the image size. The clamps are (28 - 13.3 + 4.2) / 31 on the right, (10.4 + 3) / 28 above.
     let (right, up) = (18.9 / 31.0, -13.4 / 28.0);
     let mut mismatches = Mismatches::default();
     for (ratio_x, ratio_y) in [(right - 0.01, up + 0.01), (right + 0.2, up + 0.01), (right - 0.01, up - 0.2)] {
@@ -254,7 +254,7 @@ fn extent_bounds_drawn_pixels_tightly() {
     for splat in small_scene(3, 20) {
         let projected = project(&view, &splat).expect("all are in front of the camera");
         let [a, b, c] = projected.conic;
-        // At the smallest sigma along each side of the box, alpha equals the drawing threshold.
+        // At the point of smallest sigma on each side of the box, alpha equals the drawing threshold.
         let [half_x, half_y] = projected.extent_px;
         for (dx, dy) in [(half_x, -b / c * half_x), (-b / a * half_y, half_y)] {
             let alpha =
@@ -327,8 +327,8 @@ fn margins_identify_ambiguous_pixels() {
     let (view, splats) = (tilted_view(), small_scene(1, 12));
     let margins = threshold_margins(&view, &splats);
     let before = decide(&view, &splats);
-    // Adding 0.1 to every logit changes alphas by up to a tenth. This may change a pixel's contributors only if its
-    // margin is as small.
+    // Adding 0.1 to every logit changes alphas by up to a tenth. Only the contributors of pixels with a smaller margin
+    // may change.
     let brighter: Vec<_> = splats.iter().map(|splat| splat.nudged(scene::SplatParam::OpacityLogit, 0.1)).collect();
     let after = decide(&view, &brighter);
     let changed: Vec<_> =
@@ -342,7 +342,7 @@ fn margins_identify_ambiguous_pixels() {
     let n_safe_in_f32 = margins.iter().filter(|&&margin| margin > 1e-4).count();
     assert!(n_safe_in_f32 > view.n_pixels() * 9 / 10, "{n_safe_in_f32} of {} pixels", view.n_pixels());
 
-    // Two splats at almost the same depth: their order is ambiguous wherever both are drawn.
+    // The order of two splats at almost the same depth is ambiguous wherever both are drawn.
     let mut pair = splats[..2].to_vec();
     pair[1].mean = pair[0].mean.map(|along| along + 1e-6);
     let margins = threshold_margins(&view, &pair);

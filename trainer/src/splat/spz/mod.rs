@@ -1,9 +1,10 @@
 //! Splats in `.spz` files (Niantic): reads versions 2 and 3, writes version 3.
 //!
-//! A gzip stream of a header, followed by the means, opacities, constant colors, scales, rotations and higher color
-//! coefficients of all splats, each value rounded to few bits (`quantize.rs`). Axes in `.spz` are right, up, back; ours
-//! are those of our `.ply`, which other programs interpret as right, down, front. Like those programs, we change the
-//! signs of y and z, so that a model has the same pose in every viewer, whether loaded from `.ply` or `.spz`.
+//! The file is a gzip stream. It contains a header and the means, opacities, constant colors, scales, rotations and
+//! higher color coefficients of all splats. Each value is quantized to a few bits (`quantize.rs`).
+//!
+//! The axes of `.spz` are right, up, back. Other programs interpret the axes of a `.ply`, which are also our axes, as
+//! right, down, front. Like those programs, we flip the signs of y and z, so that viewers show both files alike.
 //!
 //! Source: "SPZ file format", Niantic, versions 2 and 3, <https://github.com/nianticlabs/spz>.
 
@@ -20,18 +21,17 @@ use std::path::Path;
 const MAGIC: [u8; 4] = *b"NGSP";
 const GZIP: [u8; 2] = [0x1f, 0x8b];
 const HEADER_BYTES: usize = 16;
-/// Oldest version that is read: the previous one stored means as 16-bit floats.
+/// Oldest supported version. Version 1 stored means as 16-bit floats.
 const MIN_VERSION: u32 = 2;
-/// Newest version that is read, and the version that is written. Later ones are not gzip streams.
+/// Newest supported version, and the version that is written. Later versions are not gzip streams.
 const MAX_VERSION: u32 = 3;
-/// Bit of the header's flags: extensions follow the splats.
+/// Header flag: extensions follow the splats.
 const HAS_EXTENSIONS: u8 = 2;
-/// Maximum number of splats; a header with more counts as damaged.
+/// Maximum number of splats. A larger number in a header indicates damage.
 const MAX_SPLATS: u32 = 100_000_000;
-/// Maximum number of fractional bits of a mean: steps of 15 micrometers.
+/// Maximum number of fractional bits of a mean, for steps of 15 micrometers.
 const MAX_FRACTIONAL_BITS: u8 = 16;
-/// Signs of the higher color coefficients after changing the signs of y and z: negative for functions that are odd in
-/// them.
+/// Factors of the higher color coefficients when y and z change their signs: -1 for basis functions that change sign.
 const SH_SIGNS: [f32; 15] = [-1.0, -1.0, 1.0, -1.0, 1.0, 1.0, -1.0, 1.0, -1.0, 1.0, -1.0, -1.0, 1.0, -1.0, 1.0];
 
 /// Reads a `.spz` file of splats.
@@ -40,9 +40,9 @@ pub fn read(path: &Path) -> Result<SplatArrays, Error> {
     from_bytes(&bytes).map_err(|reason| Error::SplatFile { path: path.to_owned(), reason })?.checked()
 }
 
-/// Writes a `.spz` file of splats. After a failed write, no partial file has this name.
+/// Writes a `.spz` file of splats. A failed write leaves no partial file at `path`.
 ///
-/// Values outside the range of the format are clamped, except means: coordinates beyond 8388 km are an error.
+/// Values outside the range of the format are clamped, except for means: coordinates beyond 8388 km are an error.
 pub fn write(path: &Path, splats: &SplatArrays) -> Result<(), Error> {
     let uncompressed = uncompressed_bytes(&splats.clone().checked()?)?;
     atomic_file::write(path, |file| {
@@ -71,7 +71,7 @@ impl Header {
             (word(4), word(8), [bytes[12], bytes[13], bytes[14], bytes[15]]);
         check_version(version)?;
         if n_splats > MAX_SPLATS {
-            return Err(format!("the header has {n_splats} splats, expected at most {MAX_SPLATS}"));
+            return Err(format!("the header specifies {n_splats} splats, expected at most {MAX_SPLATS}"));
         }
         if sh_degree > 3 {
             return Err(format!("spherical harmonics of degree {sh_degree}, expected at most 3"));
@@ -182,12 +182,12 @@ fn splats(header: &Header, body: &[u8]) -> SplatArrays {
     }
 }
 
-/// Rotation by half a turn about x: converts between our axes and those of the format.
+/// Rotates by 180 degrees about x, which converts between our axes and those of the format.
 fn flipped([x, y, z]: [f32; 3]) -> [f32; 3] {
     [x, -y, -z]
 }
 
-/// Encodes header and splats before compression.
+/// Encodes the header and the splats without compression.
 fn uncompressed_bytes(splats: &SplatArrays) -> Result<Vec<u8>, Error> {
     let n_splats = u32::try_from(splats.n_splats()).ok().filter(|n| *n <= MAX_SPLATS).ok_or_else(|| {
         Error::SplatArrays(format!("found {} splats, .spz holds at most {MAX_SPLATS}", splats.n_splats()))
@@ -219,7 +219,7 @@ fn uncompressed_bytes(splats: &SplatArrays) -> Result<Vec<u8>, Error> {
     Ok(bytes)
 }
 
-/// Largest number of fractional bits with which the mean farthest out still fits.
+/// Largest number of fractional bits at which all means are in range.
 fn fractional_bits(means: &[[f32; 3]]) -> Result<u8, Error> {
     let max_coordinate_m = means.as_flattened().iter().map(|meters| f64::from(meters.abs())).fold(0.0, f64::max);
     let fits = |bits: &u8| max_coordinate_m * f64::from(1_u32 << bits) <= f64::from(quantize::MAX_FIXED);

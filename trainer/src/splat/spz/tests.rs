@@ -5,7 +5,7 @@ use crate::spherical_harmonics as sh;
 use crate::splat::cloud::synthetic_cloud;
 use nalgebra::{Quaternion, UnitQuaternion, Vector3};
 
-/// Splats of a cloud, with fewer color coefficients.
+/// A cloud of `n_splats` splats of this SH degree.
 fn cloud_of_degree(n_splats: usize, sh_degree: u32) -> SplatArrays {
     let cloud = synthetic_cloud(n_splats, 1);
     let n_kept = (sh_degree as usize + 1).pow(2);
@@ -24,7 +24,7 @@ fn quaternion(wxyz: [f32; 4]) -> UnitQuaternion<f64> {
     UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z))
 }
 
-/// Checks the largest difference of two lists against a tight bound.
+/// Checks that the largest difference of two lists is within a bound and exceeds half of it.
 fn assert_max_difference(what: &str, got: &[f32], expected: &[f32], bound: f32) {
     assert_eq!(got.len(), expected.len(), "{what}");
     let worst = got.iter().zip(expected).map(|(got, expected)| (got - expected).abs()).fold(0.0, f32::max);
@@ -79,7 +79,7 @@ fn every_value_round_trips_within_its_step() {
                 0.5 / 128.0,
             );
         }
-        // A second round trip changes nothing, except rotations whose two largest components are nearly equal.
+        // A second round trip can only change rotations whose two largest components are nearly equal.
         write(&path, &decoded).unwrap();
         let decoded_twice = read(&path).unwrap();
         assert!(
@@ -94,13 +94,13 @@ fn every_value_round_trips_within_its_step() {
     assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1, "no partial file remains");
 }
 
-/// Every byte of a file with one splat, computed by hand from the format's specification.
+/// The expected bytes are computed by hand from the specification of the format.
 #[test]
 fn one_splat_file_has_the_specified_bytes() {
     let splat = SplatArrays {
         means: vec![[1.0, -2.0, 3.0]],
         log_scales: vec![[-10.0, -3.0, 5.9375]],
-        // A quarter turn about y, with the opposite sign and twice the length.
+        // A rotation by 90 degrees about y. The quaternion is negated and not normalized.
         rotations_wxyz: vec![[-2.0, 0.0, -2.0, 0.0]],
         opacity_logits: vec![0.0],
         sh: vec![[0.0, 1.0, -9.0], [0.25, 0.5, -0.5], [0.0, 1.0, -1.0], [0.125, 0.0, 0.0]],
@@ -111,11 +111,11 @@ fn one_splat_file_has_the_specified_bytes() {
         b'N', b'G', b'S', b'P', 3, 0, 0, 0, 1, 0, 0, 0, 1, 16, 0, 0, // One splat of degree 1, 16 fractional bits.
         0x00, 0x00, 0x01, 0x00, 0x00, 0x02, 0x00, 0x00, 0xfd,        // 1, 2 and -3 times 2^16: y and z change sign.
         128,                                                         // Half of 255, rounded up.
-        128, 166, 0,                                                 // 127.5 + 38.25 each, clamped at the lower end.
+        128, 166, 0,                                                 // 127.5 + 38.25 * coefficient, clamped at 0.
         0, 112, 255,                                                 // 16 (log scale + 10)
-        // x = 0, -y = -1/sqrt(2), -z = 0, w = 1/sqrt(2): y is the first of the two largest, so signs flip and y is
-        // omitted.
-        0xff, 0x03, 0x00, 0x40,                                      // 01, x 0 0, z 0 0, w 1 511
+        // (x, -y, -z, w) is (0, -1, 0, 1) / sqrt(2). y is the first of the two largest components and therefore
+        // omitted; the other signs flip because y is negative.
+        0xff, 0x03, 0x00, 0x40,                                      // Index 01; sign and magnitude: 0 0, 0 0, 1 511.
         96, 64, 192,                                                 // -y: 128 - 32, - 64, + 64
         128, 0, 255,                                                 // -z: 128, - 128, + 128 clamped at the upper end
         144, 128, 128,                                               // x: 128 + 16
@@ -133,7 +133,7 @@ fn one_splat_file_has_the_specified_bytes() {
     assert!(quaternion(decoded.rotations_wxyz[0]).angle_to(&quaternion(splat.rotations_wxyz[0])).to_degrees() < 1.5);
 }
 
-/// Colors viewed along a direction equal those of the flipped splat viewed along the flipped direction.
+/// The color in a direction equals the color of the flipped splat in the flipped direction.
 #[test]
 fn colors_follow_the_axis_flip() {
     let coefficients: Vec<[f64; 3]> = synthetic_cloud(1, 5).sh.iter().map(|rgb| rgb.map(f64::from)).collect();
@@ -202,7 +202,7 @@ fn any_bytes_decode_to_finite_splats() {
 }
 
 #[test]
-fn unwritable_values_are_reported() {
+fn unsupported_values_are_rejected() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("scene.spz");
     let mut cloud = cloud_of_degree(3, 0);

@@ -1,4 +1,4 @@
-//! Checkpoints of a splat model in training. They contain all state that affects further training, bit for bit.
+//! Checkpoints of a splat model in training. They contain all state that affects further training, without rounding.
 
 use super::SplatTrainer;
 use super::saved_arrays::{CAMERA_PARAMS, PendingArrays, invalid_state, read_seeds, read_splats};
@@ -21,32 +21,32 @@ use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 
 const METHOD: &str = SplatOptions::METHOD;
-/// Prefix of the array names of the other state of a trial in progress.
+/// Name prefix of the arrays of [`RunningTrial::other`].
 const OTHER: &str = "other_";
 
-/// The state except for the arrays.
+/// Everything in a checkpoint except the arrays.
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct SavedState {
-    /// Options with the values chosen for the adapter.
+    /// Options, with defaults replaced by the values chosen for the adapter.
     options: ModelOptions<SplatOptions>,
     step: u64,
     model: ModelState,
     n_non_finite: u32,
-    /// Training views in order, which determines the order of training.
+    /// Training views. Their order determines the training order.
     views: Vec<KeyframeSignature>,
-    /// Indices of the views that wait for their splats.
+    /// Indices of the views that have not been seeded yet.
     unseeded: Vec<usize>,
-    /// Slots of the parameters of cameras and images.
+    /// Parameter slots of cameras and images.
     slots: CameraSlots,
     remaining_trials: RemainingTrials,
     finished_trials: Vec<Trial>,
-    /// A trial in progress.
+    /// The running trial, if any.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     trial: Option<TrialState>,
 }
 
-/// What a trial restores, except for the arrays and the step.
+/// The state that a trial may restore, without the arrays and the step.
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct ModelState {
@@ -63,14 +63,14 @@ struct ModelState {
     params: ParamSet,
 }
 
-/// A trial in progress. The half in training is the state above; the arrays of the other state have a prefix.
+/// A running trial. [`SavedState::model`] is the state in training; `other` is the state in [`RunningTrial::other`].
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct TrialState {
     candidate: Candidate,
     until: u64,
     scored: Vec<ImageKey>,
-    /// Scores of the first half, once it is finished.
+    /// Scores of the first half, once it has ended.
     baseline_scores: Option<Vec<(ImageKey, f64)>>,
     arrivals: Vec<ArrivalState>,
     other_step: u64,
@@ -81,7 +81,7 @@ struct TrialState {
 /// Camera name and stamp in nanoseconds.
 type ImageKey = (String, i64);
 
-/// A keyframe that arrived in the first half of a trial. In the second half it is not a view until it arrives again.
+/// A keyframe that arrived in the first half of a trial. The second half adds it at the same step.
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct ArrivalState {
@@ -148,7 +148,7 @@ impl TrialState {
         }
     }
 
-    /// Restores the trial with its other state and the keyframes that arrived.
+    /// Restores the running trial. `keyframes` are its arrivals, in the same order.
     fn restored(
         self,
         gpu: &Gpu,
@@ -178,8 +178,8 @@ impl TrialState {
 }
 
 impl SplatTrainer {
-    /// Captures the state after all steps queued so far. The model is only copied within the GPU here;
-    /// [`PendingCheckpoint::finish`] copies it to the host, on any thread.
+    /// Captures the state after all queued steps. This call only copies the model within GPU memory;
+    /// [`PendingCheckpoint::finish`] copies it to the host and may run on any thread.
     pub(super) fn take_checkpoint(&mut self) -> Result<PendingCheckpoint, Error> {
         self.seed_from_depth()?;
         self.finish_in_flight()?;
@@ -218,8 +218,8 @@ impl SplatTrainer {
         }))
     }
 
-    /// Resumes from a checkpoint as if training had not been interrupted. All keyframes that were trained on must be
-    /// among `keyframes`. Returns the other keyframes, to be pushed or kept for testing.
+    /// Resumes training from a checkpoint as if it had not been interrupted. `keyframes` must include all training
+    /// keyframes of the checkpoint. Returns the remaining keyframes, to be pushed or kept for testing.
     ///
     /// # Errors
     ///
@@ -237,7 +237,7 @@ impl SplatTrainer {
         }
         let state: SavedState =
             serde_json::from_value(checkpoint.state.clone()).map_err(|error| invalid_state(error.to_string()))?;
-        // In the second half of a trial, some keyframes have yet to arrive again; in the first half, they are views.
+        // In the first half of a trial, its arrivals are views. In the second half, they are added at a later step.
         let arrivals = || state.trial.iter().flat_map(|trial| &trial.arrivals).map(|arrival| &arrival.image);
         let is_second_half = state.trial.as_ref().is_some_and(|trial| trial.baseline_scores.is_some());
         let yet_to_arrive = arrivals().filter(|_| is_second_half);

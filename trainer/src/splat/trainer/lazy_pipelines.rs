@@ -1,4 +1,4 @@
-//! The training pipelines, compiled on another thread or on demand, because that takes seconds.
+//! Training pipelines, compiled on another thread or on demand because compilation takes seconds.
 
 use crate::Error;
 use crate::gpu::Gpu;
@@ -6,18 +6,18 @@ use crate::splat::kernels::TrainPipelines;
 use std::sync::Arc;
 use std::thread::JoinHandle;
 
-/// The training pipelines, once they are compiled.
+/// Compilation state of the training pipelines.
 #[derive(Debug)]
 pub(super) enum LazyPipelines {
-    /// Compiled when they are needed.
+    /// To be compiled on first use.
     OnDemand,
     Compiling(Compiling),
     Ready(Arc<TrainPipelines>),
     Failed,
 }
 
-/// Pipelines being compiled on a thread. Dropping it waits for the thread, because NVIDIA's driver corrupts the heap
-/// if a process exits while the driver compiles.
+/// A thread that compiles the pipelines. Drop waits for the thread, because NVIDIA's driver corrupts the heap if the
+/// process exits during compilation.
 #[derive(Debug)]
 pub(super) struct Compiling(Option<JoinHandle<Result<TrainPipelines, Error>>>);
 
@@ -40,7 +40,7 @@ impl LazyPipelines {
         Self::Compiling(Compiling(Some(std::thread::spawn(move || TrainPipelines::new(&gpu)))))
     }
 
-    /// Waits for the pipelines.
+    /// Waits for the pipelines, or compiles them on first use.
     pub(super) fn wait(&mut self, gpu: &Gpu) -> Result<Arc<TrainPipelines>, Error> {
         if let Self::Ready(ready) = self {
             return Ok(ready.clone());
@@ -54,7 +54,7 @@ impl LazyPipelines {
         Ok(ready)
     }
 
-    /// The pipelines, unless they must be waited for.
+    /// The pipelines, if an earlier [`Self::wait`] has returned them.
     pub(super) fn ready(&self) -> Option<Arc<TrainPipelines>> {
         match self {
             Self::Ready(ready) => Some(ready.clone()),

@@ -7,16 +7,16 @@ use crate::splat::params::Rule;
 use crate::splat::schedule::Schedule;
 use crate::splat::snapshot::ObservedScene;
 
-/// Learning rate of the means, in scene sizes, and the fraction of it at the end of the planned steps.
+/// Initial learning rate of the means, in scene sizes, and the fraction that remains after the planned steps.
 const MEAN_RATE: f32 = 1.6e-4;
 const FINAL_MEAN_RATE_FRAC: f32 = 0.01;
 const LOG_SCALE_RATE: f32 = 5e-3;
 const ROTATION_RATE: f32 = 1e-3;
 const OPACITY_RATE: f32 = 5e-2;
-/// Learning rate of the constant color; the others are slower by the next factor.
+/// Learning rate of the constant color term. For all other SH coefficients, it is divided by [`SH_REST_DIVISOR`].
 const SH_DC_RATE: f32 = 2.5e-3;
 const SH_REST_DIVISOR: f32 = 20.0;
-/// Decay of Adam's moments, and the number added to its denominator.
+/// Adam's decay rates and epsilon.
 const BETAS: [f32; 2] = [0.9, 0.999];
 const EPSILON: f32 = 1e-15;
 /// Range of the splats' standard deviations, in scene sizes.
@@ -24,7 +24,7 @@ const SCALE_RANGE: [f32; 2] = [1e-5, 2.0];
 /// Maximum costs of opacity and size relative to the color loss.
 const MAX_COST: f64 = 0.1;
 
-/// The rule for the next steps on `n_views` images with `n_splats` splats.
+/// Returns the update rule of the next steps, which train `n_splats` splats on `n_views` images.
 pub(super) fn rule(
     options: &ModelOptions<SplatOptions>,
     schedule: &Schedule,

@@ -1,4 +1,4 @@
-//! Everything that training optimizes, and the growth of the splat count up to a limit.
+//! The optimized state: splats and camera parameters. Grows the splat count up to a limit.
 
 use super::recorder::Recorder;
 use super::renderer::Renderer;
@@ -13,9 +13,9 @@ use crate::splat::options::SplatOptions;
 use crate::splat::params::Growth;
 use crate::splat::passes::{self, GrowthBuffers};
 
-/// Standard deviation of a child's position within its parent, in standard deviations of the parent.
+/// Standard deviation of a child's offset from its parent, in standard deviations of the parent.
 const CHILD_SPREAD: f32 = 0.5;
-/// Splats with a lower opacity are replaced.
+/// Splats below this opacity are replaced.
 const MIN_OPACITY: f32 = 0.005;
 
 /// Splats and camera parameters in training.
@@ -61,8 +61,8 @@ impl TrainedModel {
         Ok(())
     }
 
-    /// Replaces dead splats by children of other splats, and adds children up to the limit: a fraction `growth_frac`
-    /// of the splats. `key` seeds the random choices.
+    /// Replaces dead splats with children of other splats, then adds more children: a fraction `growth_frac` of the
+    /// splat count, up to the limit. `key` seeds the random choices.
     pub(super) fn grow(
         &mut self,
         recorder: &mut Recorder,
@@ -99,7 +99,7 @@ impl TrainedModel {
         Ok(())
     }
 
-    /// Ensures capacity for `n_splats`. If the GPU has no memory for them, returns the smaller number that fits.
+    /// Reserves capacity for `n_splats`. Returns that number, or a smaller one if GPU memory is insufficient.
     fn reserve_up_to(&mut self, recorder: &mut Recorder, renderer: &mut Renderer, n_splats: u32) -> Result<u32, Error> {
         if self.is_full {
             return Ok(n_splats.min(self.splats.capacity));
@@ -120,7 +120,7 @@ impl TrainedModel {
             return Ok(());
         }
         let capacity = n_splats.max(have.saturating_mul(3) / 2).min(self.max_splats.max(n_splats));
-        // Before the model itself, because every model that fits must also be drawable.
+        // Reserve the drawing buffers first, so that every model that fits into memory can also be drawn.
         renderer.reserve_splats(recorder, capacity)?;
         self.splats = self.splats.resized(&recorder.gpu, capacity, self.splats.sh_degree)?;
         recorder.passes.clear_bindings();
@@ -134,7 +134,7 @@ impl TrainedModel {
     }
 }
 
-/// Picks `n` of the splats, evenly over their list.
+/// Picks `n` splats at even intervals of the list.
 fn spread_out(arrays: &SplatArrays, n: usize) -> SplatArrays {
     let picks: Vec<usize> = (0..n).map(|ix| ix * arrays.n_splats() / n).collect();
     let n_coeffs = arrays.n_coefficients();

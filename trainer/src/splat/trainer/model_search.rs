@@ -19,8 +19,8 @@ impl SplatTrainer {
         }
     }
 
-    /// Starts, advances and ends trials. All consequences of the end of a trial are applied at the same step, because
-    /// the end of the next submit depends on timing.
+    /// Starts, advances and ends trials until nothing is due, so that all effects of a trial's end apply at the same
+    /// step. Postponing them to the next submit would make training depend on timing.
     pub(super) fn try_when_due(&mut self) -> Result<(), Error> {
         while self.trials.due(self.trial_context()) != Due::Nothing {
             self.finish_in_flight()?; // A failed submit may reduce the step count.
@@ -45,7 +45,7 @@ impl SplatTrainer {
         Ok(())
     }
 
-    /// Restores the state at the beginning of a trial and applies the change.
+    /// Restores the state at the start of the trial and applies the tested change.
     fn begin_second_half(&mut self) -> Result<(), Error> {
         let baseline_db = self.score_validation()?;
         let snapshot = match self.snapshot() {
@@ -65,7 +65,7 @@ impl SplatTrainer {
         self.prepare_training()
     }
 
-    /// Adds a keyframe at the step of its arrival in the first half.
+    /// Adds a keyframe in the second half, at the same step at which it arrived in the first half.
     fn add_next_arrival(&mut self) -> Result<(), Error> {
         let Some(keyframe) = self.trials.next_arrival() else { return Ok(()) };
         self.add_arrival(keyframe)?;
@@ -79,8 +79,8 @@ impl SplatTrainer {
         self.prepare_training()
     }
 
-    /// Ends a trial: restores the state without the change if it was rejected, then adds the keyframes that arrived
-    /// meanwhile.
+    /// Ends a trial. Restores the state without the change if the change was rejected. Then adds the keyframes that
+    /// arrived in the second half.
     fn end_trial(&mut self, TrialEnd { restored, seeded, deferred }: TrialEnd) -> Result<(), Error> {
         if let Some(snapshot) = restored {
             self.restore_snapshot(snapshot)?;
@@ -89,19 +89,19 @@ impl SplatTrainer {
         deferred.into_iter().try_for_each(|keyframe| self.add_arrival(keyframe))
     }
 
-    /// Ends a trial in its second half without a decision.
+    /// Cancels a trial that is in its second half.
     pub(super) fn cancel_trial(&mut self) -> Result<(), Error> {
         let Some(canceled) = self.trials.cancel() else { return Ok(()) };
-        log::info!("training stopped during a trial: saved the model without the change");
+        log::info!("training stopped during a trial; saving the model without the tested change");
         self.end_trial(canceled)
     }
 
-    /// Ends all trials, which need copies of the model, if there is no memory for them. Training continues.
+    /// Stops all trials after an out-of-memory error, because trials need a copy of the model. Training continues.
     fn end_trials_without_memory(&mut self, error: Error) -> Result<(), Error> {
         if !error.is_out_of_memory() {
             return Err(error);
         }
-        log::warn!("model changes are no longer tested: {error}");
+        log::warn!("stopped testing model changes: {error}");
         self.release_validation()
     }
 

@@ -1,5 +1,5 @@
-//! Reduction of the model's size: contribution of each splat, pruning of the least contributing ones, and lower color
-//! degrees.
+//! Reduces the model's size: computes the contribution of each splat, prunes the splats that contribute least, and
+//! lowers the SH degree.
 
 use super::SplatTrainer;
 use super::optimizer::StepContext;
@@ -24,7 +24,7 @@ impl SplatTrainer {
             self.reserve_view(self.views.size_px((*view_ix, 0)))?;
         }
         if let Some(image_buffers) = &self.optimizer.image_buffers {
-            // An error of one at every pixel, and a gradient of zero.
+            // With an error of one at every pixel, a splat's error sum equals the sum of its blending weights.
             self.recorder.gpu.write(
                 &image_buffers.pixel_totals,
                 0,
@@ -44,7 +44,7 @@ impl SplatTrainer {
                 let view = optimizer.prepared_view(&context, passes, views.ready_level((view_ix, 0))?)?.view;
                 view.draw(passes, &renderer.pipelines);
                 view.backward(passes, learn);
-                view.contribute(passes, learn, &contributions); // Adds nothing if a buffer was too small.
+                view.contribute(passes, learn, &contributions); // Has no effect if a buffer was too small.
                 passes.submit(gpu);
                 let counters: Vec<u32> = gpu.read(&optimizer.status, status::LEN)?;
                 if !self.renderer.grow_scratch(&mut self.recorder, &counters)? {
@@ -71,7 +71,7 @@ impl SplatTrainer {
         Ok(())
     }
 
-    /// Lowers the degree of the colors.
+    /// Lowers the SH degree.
     pub(super) fn lower_degree(&mut self, sh_degree: u32) -> Result<(), Error> {
         let splats = &mut self.model.splats;
         *splats = splats.resized(&self.recorder.gpu, splats.capacity, sh_degree)?;
@@ -80,7 +80,7 @@ impl SplatTrainer {
     }
 }
 
-/// Copies the splats with the given indices, and their moments.
+/// Copies the splats with the given indices, including their moments.
 fn gather_splats(
     recorder: &mut Recorder,
     splats: &SplatBuffers,
@@ -205,7 +205,7 @@ mod tests {
         all
     }
 
-    /// Adds noise of up to a quarter of the range to the images: no model can score much more than 21 dB on them.
+    /// Adds noise of up to a quarter of the value range. No model can score much more than 21 dB on such images.
     fn noisy(keyframes: &[Arc<Keyframe>]) -> Vec<Arc<Keyframe>> {
         let noisy = |keyframe: &Arc<Keyframe>| {
             let mut state = keyframe.stamp.0.cast_unsigned();
@@ -222,11 +222,11 @@ mod tests {
         keyframes.iter().map(noisy).collect()
     }
 
-    /// Noise hides the details, so few splats suffice, with colors that do not depend on the direction.
+    /// Noise hides the details, so a few splats with view-independent colors suffice.
     #[test]
     fn model_size_fits_the_scene_and_is_reproducible() {
         let gpu = Gpu::open(&GpuOptions::default()).unwrap();
-        let clean = n_keyframes(&gpu, 36, false); // Starts with a cloud as large as the limit.
+        let clean = n_keyframes(&gpu, 36, false); // Without depth, training starts at the maximum number of splats.
         let keyframes = noisy(&clean);
         let mut tested = trained(CountPolicy::Tested, &keyframes, gpu.clone(), 1750);
         let mut again = trained(CountPolicy::Tested, &keyframes, gpu, 1750);
@@ -251,7 +251,7 @@ mod tests {
         assert!(reached > ceiling - 1.5, "{reached} of {ceiling} dB, {reported:?}");
     }
 
-    /// While a trial halves the splats, viewers still see all of them.
+    /// While a trial tests half of the splats, all splats are still displayed.
     #[test]
     fn running_trial_is_not_displayed() {
         let (mut trainer, keyframes) = some_trained(400);

@@ -1,4 +1,4 @@
-//! Training steps: the passes of a step, its buffers and its counters.
+//! The passes, buffers and counters of training steps.
 
 use super::lazy_pipelines::LazyPipelines;
 use super::model::TrainedModel;
@@ -34,7 +34,7 @@ pub(super) struct Optimizer {
     pub(super) n_non_finite: u64,
 }
 
-/// What the passes of a step use besides the optimizer.
+/// Resources of a step that the optimizer does not own.
 #[derive(Clone, Copy)]
 pub(super) struct StepContext<'a> {
     pub(super) gpu: &'a Gpu,
@@ -92,12 +92,12 @@ impl Optimizer {
         renderer::write_n_splats(gpu, &self.status, n_splats);
     }
 
-    /// Sets the counters of the GPU.
+    /// Sets one counter on the GPU.
     pub(super) fn write_counter(&self, gpu: &Gpu, counter: usize, value: u32) {
         gpu.write(&self.status, 4 * counter as u64, &value.to_le_bytes());
     }
 
-    /// Clears the failure of a submit.
+    /// Clears the failure flag of a submit.
     pub(super) fn clear_failure(&self, gpu: &Gpu) {
         renderer::clear_failure(gpu, &self.status);
     }
@@ -114,7 +114,7 @@ impl Optimizer {
         renderer::reserve_image(recorder, &mut self.image_buffers, size_px, true)
     }
 
-    /// Records the passes of one step on a view, whose buffers must be reserved.
+    /// Records the passes of one step on a view. Requires a previous [`Self::reserve_view`].
     pub(super) fn record_step(
         &self,
         context: &StepContext<'_>,
@@ -143,7 +143,7 @@ impl Optimizer {
         Ok(())
     }
 
-    /// A view with its current camera parameters; records the pass that computes them.
+    /// Returns a view with the current camera parameters applied, and records the pass that applies them.
     pub(super) fn prepared_view<'a>(
         &'a self,
         context: &StepContext<'a>,
@@ -167,12 +167,12 @@ impl Optimizer {
         Ok(PreparedView { view, level, lens })
     }
 
-    /// Submits the recorded steps; the read-back returns the counters after them.
+    /// Submits the recorded steps and starts reading back the counters.
     pub(super) fn submit(&self, recorder: &mut Recorder) -> PendingRead {
         recorder.passes.submit_reading(&recorder.gpu, &[(&self.status, 4 * status::LEN)])
     }
 
-    /// Records the number of non-finite gradients; logs a warning at the first ones and at each doubling.
+    /// Stores the number of non-finite gradients. Logs a warning when it becomes nonzero and at each doubling.
     pub(super) fn log_non_finite(&mut self, n_non_finite: u64) {
         if n_non_finite.checked_ilog2() > self.n_non_finite.checked_ilog2() {
             log::warn!("dropped {n_non_finite} non-finite gradients of splats so far");

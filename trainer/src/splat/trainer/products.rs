@@ -1,12 +1,12 @@
-//! Sums over the pixels of a picture and an image, computed by `score.wgsl`. Scores and gains follow from them.
+//! Scores and gains of a rendered picture against a camera image, from the pixel sums that `score.wgsl` computes.
 
 use crate::Error;
 use crate::gpu::{Buffer, Gpu, Passes, Pipeline};
 use crate::splat::buffers::ImageBuffers;
 
-/// Size of a workgroup's sums in `score.wgsl`, bytes.
+/// Bytes of sums that each workgroup of `score.wgsl` writes.
 const GROUP_BYTES: usize = 48;
-/// Number of pixels of a workgroup.
+/// Pixels per workgroup.
 const GROUP_PIXELS: u32 = 256;
 
 /// Sums of products for one color.
@@ -18,7 +18,7 @@ pub(super) struct Products {
     n_visible: u64,
 }
 
-/// Records the comparison of a picture with an image; returns the number of bytes of sums that it writes.
+/// Records the comparison of a picture with an image. Returns the size of the resulting sums in bytes.
 pub(super) fn record(
     gpu: &Gpu,
     passes: &mut Passes,
@@ -38,7 +38,7 @@ pub(super) fn record(
     GROUP_BYTES * n_groups as usize
 }
 
-/// The sums over all workgroups, for red, green and blue.
+/// Adds up the sums of all workgroups, for red, green and blue.
 pub(super) fn sum_up(sums: &[[u32; 4]]) -> [Products; 3] {
     let sum = |color: usize, part: usize| sums.iter().skip(color).step_by(3).map(|of| u64::from(of[part])).sum();
     [0, 1, 2].map(|color| Products {
@@ -69,7 +69,7 @@ pub(super) fn psnr_with_gains(products: &[Products; 3], gains: [f64; 3]) -> Opti
         gain * gain * color.picture_picture as f64 - 2.0 * gain * color.picture_image as f64 + color.image_image as f64
     };
     let squares: f64 = products.iter().zip(gains).map(square).sum();
-    // A squared error of at least one bounds the score: one level of one color at one pixel.
+    // The score stays finite: the squared error is at least one, that is, one level of one color at one pixel.
     (n > 0).then(|| 10.0 * (255.0f64.powi(2) * n as f64 / squares.max(1.0)).log10())
 }
 

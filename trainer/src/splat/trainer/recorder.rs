@@ -20,7 +20,7 @@ impl Recorder {
         self.passes.submit(&self.gpu);
     }
 
-    /// Submits the recorded passes before buffers that they use are replaced.
+    /// Submits the recorded passes and releases their buffers, which may then be replaced.
     pub(super) fn submit_and_release_buffers(&mut self) {
         self.submit();
         self.passes.clear_bindings();

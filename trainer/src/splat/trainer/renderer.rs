@@ -1,5 +1,4 @@
-//! Draws splats from pinhole cameras. Its pipelines and scratch buffers are also those of the first part of a training
-//! step.
+//! Draws splats from pinhole cameras. The forward pass of training uses the same pipelines and scratch buffers.
 
 use super::products::{self, Products};
 use super::recorder::Recorder;
@@ -10,7 +9,7 @@ use crate::splat::params::{Camera, Supervision, View, status};
 use crate::splat::passes::ViewPasses;
 use crate::{Error, Picture};
 
-/// Minimum number of entries of the bins' lists.
+/// Minimum capacity of the bin lists, in entries.
 const MIN_ENTRIES: u32 = 1 << 14;
 
 /// Draws pinhole views of splats.
@@ -22,7 +21,7 @@ pub(super) struct Renderer {
     status: Buffer,
     view: Buffer,
     background: Buffer,
-    /// Image buffer of the last comparison with an image in host memory, for reuse.
+    /// Buffer for images uploaded for comparison, kept for reuse.
     compared: Option<Buffer>,
 }
 
@@ -34,7 +33,7 @@ pub(super) struct DrawnView<'a> {
     pub(super) background_srgb: [f32; 3],
 }
 
-/// What is read back of a picture.
+/// Results to read back after drawing.
 #[derive(Clone, Copy, Debug)]
 enum ReadParts<'a> {
     Picture {
@@ -106,8 +105,8 @@ impl Renderer {
         Ok(products)
     }
 
-    /// Draws a view and passes the bytes of the requested parts to `take`. The same read returns counters that show
-    /// whether all intersections fitted; if not, the view is drawn again.
+    /// Draws a view and passes the bytes of the requested parts to `take`. If a buffer was too small, grows it and
+    /// draws again.
     fn draw<R>(
         &mut self,
         recorder: &mut Recorder,
@@ -155,12 +154,12 @@ impl Renderer {
         }
     }
 
-    /// The scratch buffers, after they were reserved.
+    /// The scratch buffers, which must be reserved first.
     pub(super) fn scratch(&self) -> Result<&Scratch, Error> {
         self.scratch.as_ref().map(|(_, scratch)| scratch).ok_or(Error::DeviceLost)
     }
 
-    /// Ensures that a view of this size of up to `capacity` splats can be drawn, or trained on.
+    /// Reserves buffers to draw a view of this size with up to `capacity` splats, and to train on it if `learned`.
     pub(super) fn reserve_view(
         &mut self,
         recorder: &mut Recorder,
@@ -173,7 +172,7 @@ impl Renderer {
         self.reserve(recorder, ScratchSize { n_splats: capacity, n_entries, n_slots, n_bins: n_bins(size_px) })
     }
 
-    /// Ensures that views of up to `capacity` splats can be drawn; does nothing before the first view.
+    /// Reserves buffers to draw up to `capacity` splats. Does nothing before the first view.
     pub(super) fn reserve_splats(&mut self, recorder: &mut Recorder, capacity: u32) -> Result<(), Error> {
         let Some((have, _)) = self.scratch else { return Ok(()) };
         let n_entries = have.n_entries.max(2 * capacity);
@@ -181,7 +180,7 @@ impl Renderer {
         self.reserve(recorder, ScratchSize { n_splats: capacity, n_entries, n_slots, ..have })
     }
 
-    /// Grows the scratch buffers after a failed submit. Returns whether it had failed.
+    /// Grows the scratch buffers if the submit failed. Returns whether the submit failed.
     pub(super) fn grow_scratch(&mut self, recorder: &mut Recorder, counters: &[u32]) -> Result<bool, Error> {
         if counters[status::FAILED] == 0 {
             return Ok(false);
@@ -193,7 +192,7 @@ impl Renderer {
             n_slots: if size.n_slots == 0 { 0 } else { larger(counters[status::NEED_SLOTS], size.n_slots) },
             ..size
         };
-        log::debug!("splat: intersections need {need:?}");
+        log::debug!("splat: growing the intersection buffers to {need:?}");
         self.reserve(recorder, need)?;
         Ok(true)
     }
@@ -229,7 +228,7 @@ impl Renderer {
     }
 }
 
-/// Ensures that a picture of this size fits into the buffers; those of gradients only if `learned`.
+/// Reserves buffers for a picture of this size, including its gradients if `learned`.
 pub(super) fn reserve_image(
     recorder: &mut Recorder,
     image_buffers: &mut Option<ImageBuffers>,
@@ -251,7 +250,7 @@ pub(super) fn write_n_splats(gpu: &Gpu, status: &Buffer, n_splats: u32) {
     gpu.write(status, 4 * u64::from(status::N_SPLATS), bytemuck::bytes_of(&n_splats));
 }
 
-/// Clears the failure of a submit and the sizes that it needed.
+/// Clears the failure flag and the requested buffer sizes.
 pub(super) fn clear_failure(gpu: &Gpu, status: &Buffer) {
     gpu.write(status, 4 * status::FAILED as u64, &[0; 12]);
 }

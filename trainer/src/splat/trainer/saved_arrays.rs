@@ -22,7 +22,7 @@ pub(super) fn read_splats(
 ) -> Result<SplatBuffers, Error> {
     if n_splats > capacity || active_degree > sh_degree || sh_degree > 3 {
         return Err(invalid_state(format!(
-            "{n_splats} splats of degree {active_degree} do not fit a capacity of {capacity} and degree {sh_degree}"
+            "{n_splats} splats of SH degree {active_degree} do not fit capacity {capacity} and SH degree {sh_degree}"
         )));
     }
     let mut splats = SplatBuffers::new(gpu, capacity, sh_degree)?;
@@ -49,7 +49,7 @@ pub(super) fn read_seeds(checkpoint: &Checkpoint, prefix: &str, n_seeds: u64) ->
     Ok(Seeder::from_bytes(array(SEED_POSITIONS, Seeder::POSITION_BYTES)?, array(SEED_CELLS, Seeder::CELL_BYTES)?))
 }
 
-/// The arrays of one state of the model while they are copied to the host.
+/// The arrays of one model state, while they are being copied to the host.
 pub(super) struct PendingArrays {
     prefix: &'static str,
     planes: Vec<Planes>,
@@ -93,7 +93,7 @@ impl PendingArrays {
     }
 }
 
-/// One buffer while it is copied to the host.
+/// One buffer, while it is being copied to the host.
 struct Planes {
     read: Option<PendingRead>,
     n_planes: usize,
@@ -122,7 +122,7 @@ fn begin_read(gpu: &Gpu, buffer: &Buffer, n_planes: u32, bytes: u64, splats: &Sp
     Some(gpu.begin_read(buffer, to_usize(n * bytes / 4)))
 }
 
-/// An error of a checkpoint's contents.
+/// Returns the error for invalid checkpoint contents.
 pub(super) fn invalid_state(reason: String) -> Error {
     Error::CheckpointState { reason }
 }

@@ -1,4 +1,4 @@
-//! Scores of the model in training on images that it was not trained on.
+//! Scores the model in training on validation images.
 
 use super::SplatTrainer;
 use super::products::{self, Products};
@@ -13,15 +13,15 @@ use keyframe::Keyframe;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
-/// A keyframe and the sums of its comparison with a picture.
+/// A keyframe and the sums from its comparison with the rendered picture.
 type ScoredKeyframe = (Arc<Keyframe>, [Products; 3]);
 
-/// Camera corrections by name.
+/// Corrections by camera name.
 type CameraCorrections = BTreeMap<String, CameraCorrection>;
 
 impl SplatTrainer {
-    /// PSNR of the displayed picture of a view against a keyframe's image of the same size; `None` before training
-    /// has started.
+    /// PSNR in dB of a displayed view against a keyframe's image; `None` if their sizes differ or training has not
+    /// started.
     pub(super) fn psnr_of_view(
         &mut self,
         camera: &Camera,
@@ -38,7 +38,7 @@ impl SplatTrainer {
         products::psnr(&products).map(Some)
     }
 
-    /// PSNR of the validation keyframes, dB; of at most a limited number, spread evenly over them.
+    /// PSNR in dB of the validation keyframes, or of an evenly spaced subset if there are many.
     pub(super) fn score_validation(&mut self) -> Result<Scores, Error> {
         let score = |(keyframe, products): &ScoredKeyframe| {
             Some(((keyframe.camera.clone(), keyframe.stamp), products::psnr_with_gains(products, [1.0; 3])?))
@@ -46,15 +46,15 @@ impl SplatTrainer {
         Ok(self.compare_validation()?.iter().filter_map(score).collect())
     }
 
-    /// Scores the validation keyframes with and without gains, which are interpolated between the images before and
-    /// after them in time. Enables gains if they are significant.
+    /// Scores the validation keyframes with and without gains, and enables gains if their benefit is significant. The
+    /// gains of a validation keyframe are interpolated in time between the neighboring training images.
     pub(super) fn try_gains(&mut self) -> Result<(), Error> {
         let validation = self.compare_validation()?;
         let corrections = self.learned_corrections()?;
         let neighbors: Vec<Vec<usize>> = validation.iter().map(|(keyframe, _)| self.neighbors(keyframe)).collect();
         let mut known: BTreeMap<usize, [f64; 3]> = BTreeMap::new();
         self.add_gains(&mut known, neighbors.iter().flatten().copied().collect(), &corrections)?;
-        // The mean over all images is an error of the model's brightness, not of an image.
+        // Subtract the mean over all images, because it is an error of the model's brightness.
         let mean = |color: usize| known.values().map(|gains| gains[color]).sum::<f64>() / known.len().max(1) as f64;
         let mean = [0, 1, 2].map(mean);
         let (mut baseline_db, mut variant_db) = (Vec::new(), Vec::new());
@@ -82,7 +82,7 @@ impl SplatTrainer {
         Ok(())
     }
 
-    /// The views of the same camera before and after a keyframe.
+    /// The last view before and the first view after a keyframe, from the same camera.
     fn neighbors(&self, keyframe: &Keyframe) -> Vec<usize> {
         let of_camera = || self.views.keyframes().enumerate().filter(|(_, other)| other.camera == keyframe.camera);
         let before = of_camera().filter(|(_, other)| other.stamp <= keyframe.stamp);
@@ -92,7 +92,7 @@ impl SplatTrainer {
         before.into_iter().chain(after).map(|(ix, _)| ix).collect()
     }
 
-    /// Computes the missing gains of these views.
+    /// Computes the gains of those views that `known` does not contain yet.
     fn add_gains(
         &mut self,
         known: &mut BTreeMap<usize, [f64; 3]>,
@@ -110,7 +110,7 @@ impl SplatTrainer {
         Ok(())
     }
 
-    /// The gains that best match the picture of a view to its image, which is on the GPU.
+    /// Logarithms of the gains that best match the picture of a view to its uploaded image.
     fn gains_of(&mut self, view_ix: usize, corrections: &CameraCorrections) -> Result<[f64; 3], Error> {
         let learn = self.learn()?;
         let camera = corrected_camera(corrections, self.views.keyframe(view_ix));
@@ -134,8 +134,8 @@ impl SplatTrainer {
         Ok(compared)
     }
 
-    /// Current corrections of each camera, including a running trial's, for keyframes that alignment has already
-    /// corrected.
+    /// Current corrections of each camera, including those of a running trial. They apply to keyframes that alignment
+    /// has already corrected.
     fn learned_corrections(&self) -> Result<CameraCorrections, Error> {
         let cameras = &self.model.cameras;
         if cameras.set.is_empty() {
@@ -207,8 +207,7 @@ mod tests {
         let mut trainer = SplatTrainer::new(gpu, options()).unwrap();
         trainer.push(keyframes[1].clone()).unwrap();
         train(&mut trainer, 20);
-        // A masked image whose mask starts and ends within workgroups, followed by complete images in the same
-        // buffer.
+        // The mask starts and ends in the middle of a workgroup. The unmasked images that follow reuse the buffer.
         let mut rgba = keyframes[0].rgba_srgb.to_vec();
         rgba.as_chunks_mut::<4>().0[250..900].iter_mut().for_each(|pixel| pixel[3] = 0);
         let masked = Keyframe { rgba_srgb: rgba.into(), ..keyframes[0].as_ref().clone() };
@@ -232,7 +231,7 @@ mod tests {
         assert_eq!(loaded.psnr(&request_for(&same), &same).unwrap(), None, "the training pipelines are not compiled");
     }
 
-    /// Darkens the images by one stop from the middle of the capture on.
+    /// Darkens the second half of the images by one stop.
     fn with_exposure_step(keyframes: &[Arc<Keyframe>]) -> Vec<Arc<Keyframe>> {
         let darken = |(ix, keyframe): (usize, &Arc<Keyframe>)| {
             let mut rgba = keyframe.rgba_srgb.to_vec();
@@ -257,7 +256,7 @@ mod tests {
         let mut trainer = trained(&stepped, gpu, 700);
         assert!(trainer.trials()[0].kept && trainer.trials()[0].gain_db > 1.0, "{:?}", trainer.trials());
         let gains = |trainer: &mut SplatTrainer, ix: usize| trainer.calibrated_camera(&stepped[ix]).unwrap().gains[1];
-        // Away from the step, no image shows a part of the scene that was captured with the other exposure.
+        // Only images near the exposure step show parts of the scene that were captured with both exposures.
         let ratio = gains(&mut trainer, 17) / gains(&mut trainer, 18);
         assert!((1.6..2.4).contains(&ratio), "{ratio}");
     }

@@ -1,4 +1,4 @@
-//! Initial splats at the surfaces that keyframes show when they arrive.
+//! Seeds splats on the surfaces visible in new keyframes.
 
 use super::view_set::ViewSet;
 use crate::model_options::ModelOptions;
@@ -10,17 +10,17 @@ use keyframe::Keyframe;
 use kinematics::quantile::{Rank, quantile};
 use std::sync::Arc;
 
-/// Maximum share of the splat limit that the seeds of one image may take, so that other images get some, too.
+/// Maximum share of the splat limit for the seeds of one image, so that enough remains for the other images.
 const SEED_SHARE: f64 = 1.0 / 8.0;
-/// Minimum number of pixels per seed. With more seeds, the first steps take longer than they gain.
+/// Minimum number of pixels per seed. A higher density slows the first steps more than it helps.
 const PX_PER_SEED: f64 = 48.0;
-/// Maximum number of seeds per image, by default.
+/// Default maximum number of seeds per image.
 const SEEDS_PER_IMAGE: f64 = 20_000.0;
 const SOFTWARE_SEEDS_PER_IMAGE: f64 = 4_000.0;
 /// Minimum scale of the scene.
 const MIN_SCENE_SIZE_M: f64 = 1e-3;
 
-/// Creates splats for keyframes that arrive.
+/// Creates the initial splats for new keyframes.
 #[derive(Debug)]
 pub(super) struct Seeding {
     pub(super) scene: ObservedScene,
@@ -49,7 +49,7 @@ impl Seeding {
         self.density.max_discs
     }
 
-    /// Adds a keyframe whose splats are still missing.
+    /// Queues a keyframe for seeding.
     pub(super) fn push(&mut self, keyframe: Arc<Keyframe>) {
         self.scene.has_depth |= keyframe.depth.is_some();
         self.pending.push(keyframe);
@@ -60,8 +60,8 @@ impl Seeding {
         self.unseeded.retain(|keyframe| !is_removed(keyframe));
     }
 
-    /// Discs at new depth readings of the keyframes that arrived since the last call; `None` if none arrived. `views`
-    /// are all training views.
+    /// Creates discs at the uncovered depth readings of the keyframes queued since the last call; `None` if there are
+    /// none. `views` are all training views.
     pub(super) fn discs_from_depth(&mut self, views: &ViewSet) -> Option<SplatArrays> {
         let arrived = std::mem::take(&mut self.pending);
         if arrived.is_empty() {
@@ -73,7 +73,7 @@ impl Seeding {
         Some(discs)
     }
 
-    /// Keyframes with areas that depth does not cover.
+    /// Takes the keyframes with areas that depth does not cover.
     pub(super) fn take_unseeded(&mut self) -> Vec<Arc<Keyframe>> {
         std::mem::take(&mut self.unseeded)
     }
@@ -95,7 +95,8 @@ impl Seeding {
     }
 }
 
-/// Scale of the scene for the learning rate of the means, from the spread of the cameras or their median depth.
+/// Scale of the scene, from the spread of the cameras and their median depth. The learning rate of the means is
+/// proportional to it.
 fn scene_size_m(views: &ViewSet) -> f64 {
     let centers: Vec<_> = views.keyframes().map(|keyframe| keyframe.world_from_camera.translation.vector).collect();
     let middle = centers.iter().sum::<nalgebra::Vector3<f64>>() / centers.len().max(1) as f64;

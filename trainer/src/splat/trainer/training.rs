@@ -1,4 +1,4 @@
-//! Training steps: what is due before a submit, its length, and its results.
+//! The training loop: performs the work that is due before a submit, sends the submit, and applies its results.
 
 use super::SplatTrainer;
 use super::learning_rates;
@@ -12,8 +12,8 @@ use std::time::Instant;
 
 /// Maximum number of steps per submit.
 const MAX_STEPS_PER_SUBMIT: u64 = 64;
-/// Number of images prepared and uploaded together while pictures are requested. A larger number would delay pictures
-/// too much.
+/// Number of images prepared and uploaded together while a viewer requests pictures. A larger number would delay the
+/// pictures too much.
 const VIEWS_AT_ONCE_WATCHED: u64 = 4;
 
 impl SplatTrainer {
@@ -39,10 +39,10 @@ impl SplatTrainer {
         }
         let counters = self.optimizer.submit(&mut self.recorder);
         self.schedule.step += n_steps;
-        let failed = self.finish_in_flight()?; // The previous submit; this one runs meanwhile.
+        let failed = self.finish_in_flight()?; // Waits for the previous submit while this one runs.
         if !failed {
             self.optimizer.submits.begin(counters, n_steps, since);
-        } // Otherwise this submit failed, too: its steps are repeated, so do not wait for it.
+        } // After a failure, this submit fails, too. Its steps are repeated, so do not wait for it.
         if n_steps == n {
             self.finish_in_flight()?; // The caller stops here, so the step count must be exact.
         }
@@ -61,7 +61,7 @@ impl SplatTrainer {
         Ok(timings)
     }
 
-    /// Changes the splat count when due: replaces dead splats, and adds splats up to the limit.
+    /// If a change of the splat count is due, replaces dead splats and adds splats up to the limit.
     fn grow_when_due(&mut self, learn: &TrainPipelines) -> Result<(), Error> {
         if !self.schedule.is_growth_due() {
             return Ok(());
@@ -76,8 +76,8 @@ impl SplatTrainer {
         self.model.grow(&mut self.recorder, &mut self.renderer, learn, growth_frac, key)
     }
 
-    /// Number of steps of the next submit: few enough for its time limit, and none past a step at which something else
-    /// is due.
+    /// Number of steps of the next submit. The submit stays within its time limit and does not pass a step at which
+    /// other work is due.
     fn n_steps_of_submit(&self, n_requested: u64) -> u64 {
         let by_time = self.optimizer.submits.n_steps_in_limit().unwrap_or(1);
         n_requested
@@ -97,8 +97,8 @@ impl SplatTrainer {
         optimizer.write_rule(gpu, &learning_rates::rule(options, schedule, &seeding.scene, views.len(), n_splats));
     }
 
-    /// Uploads the missing images of the next `n` steps. On a GPU, prepares enough images to use all processors, so
-    /// that the time of a step does not include that of its images.
+    /// Uploads the missing images of the next `n` steps. On a GPU, prepares images of later steps as well, which keeps
+    /// all CPU cores busy and avoids waiting for images in each step.
     fn prepare_images(&mut self, n: u64) -> Result<(), Error> {
         let n_at_once = match (self.recorder.gpu.is_software(), self.optimizer.submits.is_watched()) {
             (true, _) => 0,
@@ -125,7 +125,7 @@ impl SplatTrainer {
         self.optimizer.reserve_view(&mut self.recorder, &mut self.renderer, capacity, size_px)
     }
 
-    /// Waits for the submit in flight and applies its counters. Returns whether a buffer was too small for it.
+    /// Waits for the submit in flight and applies its counters. Returns whether a buffer was too small for the submit.
     pub(super) fn finish_in_flight(&mut self) -> Result<bool, Error> {
         let Some(counters) = self.optimizer.submits.finish(&self.recorder.gpu)? else { return Ok(false) };
         self.optimizer.log_non_finite(counters[status::N_NON_FINITE].into());
@@ -138,7 +138,7 @@ impl SplatTrainer {
     }
 }
 
-/// Seed of the random choices of one change of the splat count.
+/// Random seed for one change of the splat count.
 #[expect(clippy::cast_possible_truncation, reason = "bits of a hash")]
 fn growth_key(seed: u64, step: u64) -> u32 {
     (step as u32).wrapping_mul(0x9e37_79b9) ^ seed as u32

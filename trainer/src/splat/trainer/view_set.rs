@@ -1,4 +1,4 @@
-//! The training views: the order in which they are trained on, their resolution, and their images on the GPU.
+//! The training views: their training order, their resolution, and their images on the GPU.
 
 use super::recorder::Recorder;
 use crate::Error;
@@ -13,11 +13,11 @@ use std::collections::BTreeSet;
 use std::ops::Range;
 use std::sync::Arc;
 
-/// Maximum bytes of images on a software adapter, which shares the host memory that already holds all keyframes.
+/// Maximum bytes of images on a software adapter. It allocates host memory, which already holds all keyframes.
 const SOFTWARE_IMAGE_BYTES: u64 = 256 << 20;
-/// Number of images uploaded together when all views are processed in turn.
+/// Number of images uploaded together when iterating over all views.
 pub(super) const VIEWS_AT_ONCE: usize = 16;
-/// Steps at a quarter of the resolution, and step from which the full resolution is used, by default.
+/// Default of [`SplatOptions::coarse_steps`].
 const COARSE_STEPS: [u64; 2] = [150, 400];
 const SOFTWARE_COARSE_STEPS: [u64; 2] = [500, 4000];
 
@@ -29,15 +29,15 @@ pub(super) struct ViewSet {
     coarse_steps: [u64; 2],
     /// Maximum bytes of the views' images on the GPU, unless a submit needs more.
     max_image_bytes: u64,
-    /// Number of requests for images, for evicting the least recently used ones.
+    /// Number of image requests so far. Images store it at each use, and eviction compares the stored values.
     n_image_requests: u64,
 }
 
-/// Index of a view, and of a level of its images.
+/// Index of a view, and index of a resolution level of its images.
 pub(super) type ViewLevel = (usize, usize);
 
 impl ViewSet {
-    /// An empty set.
+    /// Creates an empty set.
     pub(super) fn new(options: &ModelOptions<SplatOptions>, is_software: bool) -> Self {
         Self {
             views: Vec::new(),
@@ -107,12 +107,13 @@ impl ViewSet {
         self.views[view_ix].size_at(level_ix)
     }
 
-    /// The lens of a view, if there is one, and a level whose images are uploaded.
+    /// The lens of a view, if any, and a level of the view. The images of the level must be uploaded.
     pub(super) fn ready_level(&self, (view_ix, level_ix): ViewLevel) -> Result<(Option<&Buffer>, &Level), Error> {
         self.views[view_ix].ready_level(level_ix)
     }
 
-    /// Uploads the missing images of these steps. If any is missing, uploads those of the first `n_at_once` steps, too.
+    /// Uploads the missing images of these steps. If any are missing, also uploads the images of later steps, so that
+    /// at least `n_at_once` steps are covered.
     pub(super) fn prepare_steps(
         &mut self,
         recorder: &mut Recorder,
@@ -134,7 +135,7 @@ impl ViewSet {
         self.views[view_ix].has_level(level_ix)
     }
 
-    /// Uploads the missing ones of these levels of views at a step, using all processors. Other images may be evicted.
+    /// Uploads the requested levels that are missing, using all CPU cores. May evict other images.
     pub(super) fn upload(
         &mut self,
         recorder: &mut Recorder,
@@ -155,7 +156,7 @@ impl ViewSet {
             };
             let mut dropped = views::drop_levels(&mut self.views, keep);
             if !dropped.is_empty() && !recorder.passes.is_empty() {
-                recorder.submit(); // The recorded passes use the images that are replaced.
+                recorder.submit(); // The recorded passes use images that are replaced below.
             }
             for ((view_ix, level), images) in missing.into_iter().zip(&made) {
                 let same_size = dropped.iter().position(|level| level.size_px == images.size_px());
@@ -178,7 +179,7 @@ impl ViewSet {
         if self.has_level(place) { Ok(()) } else { self.upload(recorder, &BTreeSet::from([place]), step) }
     }
 
-    /// Limits the bytes of images on the GPU, as on a software adapter.
+    /// Limits the GPU memory for images, as on a software adapter.
     #[cfg(test)]
     pub(super) fn limit_image_bytes(&mut self, max_bytes: u64) {
         self.max_image_bytes = max_bytes;
@@ -190,7 +191,7 @@ impl ViewSet {
     }
 }
 
-/// Resolution level at a step: images are smaller than full size by this power of two.
+/// Resolution level at a step. Level `n` divides width and height by `2^n`.
 fn level_at(step: u64, coarse_steps: [u64; 2]) -> u32 {
     match step {
         step if step < coarse_steps[0] => 2,

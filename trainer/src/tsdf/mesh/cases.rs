@@ -1,7 +1,8 @@
-//! How a surface crosses a cube, for each of the 256 combinations of corners inside and outside.
+//! The triangles of a surface that crosses a cube, for each of the 256 combinations of inside and outside corners.
 //!
 //! The method is marching cubes (Lorensen and Cline 1987), but the table is computed: on each face, one segment
-//! separates every run of inside corners. Two cubes therefore agree on a shared face, and segments join to loops.
+//! separates each run of inside corners from the rest. Two cubes therefore agree on a shared face, and segments join
+//! into loops.
 
 use std::sync::LazyLock;
 
@@ -82,7 +83,7 @@ mod tests {
 
     #[test]
     fn triangles_face_away_from_the_inside() {
-        // Only corner 0 is inside: the normal points towards increasing coordinates.
+        // Only corner 0 is inside: the normal points toward increasing coordinates.
         let edge_center = |edge: Edge| -> [f64; 3] {
             std::array::from_fn(|axis| if axis == edge.axis { 0.5 } else { (edge.corner >> axis & 1) as f64 })
         };

@@ -15,7 +15,7 @@ struct CellSum {
 
 impl Mesh {
     /// Returns the mesh with one vertex per cell of a grid of this width, at the mean of the merged vertices. Triangles
-    /// with coinciding corners are removed. A width that is not a positive number leaves the mesh unchanged.
+    /// that become degenerate are removed. A width that is not a positive number leaves the mesh unchanged.
     ///
     /// Source: Rossignac and Borrel 1993, with means instead of representatives.
     #[must_use]

@@ -14,8 +14,8 @@ const UNSIGNED_INT: u32 = 5125;
 const VERTICES: u32 = 34_962;
 const INDICES: u32 = 34_963;
 
-/// Writes a mesh. glTF has y up and z towards the viewer, the world has z up: one node holds that rotation, another the
-/// origin.
+/// Writes a mesh. glTF has y up and z toward the viewer, while the world has z up. One node holds that rotation,
+/// another the origin.
 pub fn write(path: &Path, mesh: &Mesh) -> Result<(), Error> {
     atomic_file::write(path, |file| file.write_all(&to_bytes(mesh)))
 }

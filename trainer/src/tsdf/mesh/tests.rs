@@ -84,7 +84,7 @@ fn mesh_of_slanted_wall_is_flat() {
     let wall = TestShape::Plane { normal, offset_m: 0.05 };
     let mut model = model(scenes::options(), &scenes::ring(&[wall], Point3::origin(), 4));
     let mut mesh = model.mesh().unwrap();
-    // Only near vertices: far away, pixels are wider than voxels and the wall is seen at an angle.
+    // Checks only near vertices: far away, pixels are wider than voxels and the wall is seen at an angle.
     let is_near = vertex_positions(&mesh).map(|vertex| vertex.coords.norm() < 0.8).collect::<Vec<_>>();
     let mut near = is_near.iter();
     mesh.positions_m.retain(|_| near.next() == Some(&true));

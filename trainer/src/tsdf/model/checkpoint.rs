@@ -1,4 +1,4 @@
-//! Checkpoints of a field: everything needed to continue bit for bit.
+//! Checkpoints of a field, from which training continues bit for bit.
 
 use super::super::block::{Block, Blocks, GridCoord, N_VOXELS};
 use super::super::chosen_grid::VoxelGrid;
@@ -31,7 +31,7 @@ pub(super) struct TsdfState {
     pub(super) n_blocks: u64,
     pub(super) fused: Vec<KeyframeSignature>,
     pub(super) n_removed: u64,
-    /// Pushed but not fused yet, in order.
+    /// Keyframes that were pushed but not fused yet, in order.
     pub(super) pending: Vec<KeyframeSignature>,
 }
 
@@ -58,8 +58,8 @@ impl TsdfModel {
         Ok((state, arrays_of(&blocks)))
     }
 
-    /// Resumes from a checkpoint as if it had not stopped. `keyframes` must include all that the model had received.
-    /// Returns the others, to be pushed or kept for testing.
+    /// Resumes training exactly where the checkpoint was taken. `keyframes` must include all that the model had
+    /// received. Also returns the other keyframes, to be pushed or kept for testing.
     pub fn resume(
         gpu: Arc<Gpu>,
         checkpoint: &Checkpoint,

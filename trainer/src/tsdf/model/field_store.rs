@@ -1,8 +1,8 @@
 //! The blocks of a field, on the GPU and in host memory.
 //!
-//! Blocks that do not fit on the GPU are kept in host memory until a camera observes them again. Before a depth image is
-//! fused, every block it could change is loaded back. The field therefore equals, bit for bit, one with unlimited
-//! memory.
+//! Blocks that do not fit on the GPU are kept in host memory until a camera observes them again. Before a depth image
+//! is fused, every block that it could change is loaded back. The field is therefore bit-identical to a field with
+//! unlimited memory.
 
 use super::frustum::ViewFrustum;
 use crate::Error;
@@ -17,7 +17,7 @@ use std::collections::BTreeSet;
 
 /// Initial capacity.
 pub(super) const INITIAL_CAPACITY: Capacity = Capacity { n_blocks: 4096, n_chunks: 512 };
-/// Fraction of the pool that is freed at once, so that not every image evicts blocks.
+/// Fraction of the pool that is freed at once, to avoid evictions for every image.
 const EVICTED_FRAC: f64 = 0.125;
 
 /// A field that may be larger than the GPU's memory.
@@ -79,7 +79,7 @@ impl FieldStore {
         capacity::max_blocks_within(gpu, self.max_bytes, self.buffers.capacity.n_chunks)
     }
 
-    /// Grows the buffers after they overflowed, and returns the number of blocks that must be evicted in addition.
+    /// Grows the buffers after an overflow. Returns the number of blocks that must also be evicted.
     pub(super) fn grow(&mut self, gpu: &Gpu, pipelines: &Pipelines, counters: &[u32]) -> Result<u32, Error> {
         let mut capacity = self.buffers.capacity;
         if counters[status::TABLE_FULL] != 0 {
@@ -98,7 +98,7 @@ impl FieldStore {
         Ok(n_needed.saturating_sub(n_allowed))
     }
 
-    /// Frees slots for at least `n` more blocks by evicting those outside the frustum. Returns whether that was
+    /// Frees slots for at least `n` more blocks by evicting blocks outside the frustum. Returns whether that was
     /// possible.
     pub(super) fn evict(
         &mut self,
@@ -143,8 +143,8 @@ impl FieldStore {
         Ok(true)
     }
 
-    /// Evicts up to `n` blocks outside the frustum to host memory, farthest first; then adds `added`. Returns how many
-    /// were evicted.
+    /// Evicts up to `n` blocks outside the frustum to host memory, farthest first; then adds `added`. Returns the
+    /// number of evicted blocks.
     fn swap_blocks(
         &mut self,
         gpu: &Gpu,

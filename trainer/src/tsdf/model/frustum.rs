@@ -1,4 +1,4 @@
-//! Which blocks a camera may observe.
+//! Determines the blocks that a camera may observe.
 
 use crate::tsdf::block::GridCoord;
 use crate::tsdf::chosen_grid::VoxelGrid;
@@ -8,7 +8,7 @@ use keyframe::Keyframe;
 use kinematics::Transform;
 use nalgebra::{Point3, Vector3};
 
-/// Added to the radius of a block, voxels: the test on the GPU rounds differently.
+/// Margin added to the radius of a block, voxels, because the test on the GPU rounds differently.
 const SLACK_VOXELS: f64 = 0.5;
 
 /// Approximate view frustum of a camera.

@@ -9,7 +9,7 @@ use crate::tsdf::params::{DepthView, status};
 use crate::tsdf::passes::{self, KeyframeSlot};
 use keyframe::Keyframe;
 
-/// Maximum number of keyframes per submit: their images are on the GPU at once.
+/// Maximum number of keyframes per submit. Their images are on the GPU at once.
 pub(super) const KEYFRAMES_PER_SUBMIT: usize = 4;
 
 /// Records and tracks submits of depth images.
@@ -18,9 +18,9 @@ pub(super) struct Fusion {
     /// Buffers of the images of a submit.
     slots: Vec<KeyframeSlot>,
     pub(super) submits: Submits,
-    /// Counter of fused depth images when the GPU was last read.
+    /// Number of fused depth images when the GPU counters were last read.
     n_fused_on_gpu: u32,
-    /// Number of readings whose surface was too far out for block coordinates.
+    /// Number of readings whose surface is outside the range of block coordinates.
     pub(super) n_outside: u32,
 }
 
@@ -39,7 +39,7 @@ impl Fusion {
         }
     }
 
-    /// Records the passes of a keyframe as the `slot_ix`-th of a submit.
+    /// Records the passes of a keyframe as step `slot_ix` of a submit.
     pub(super) fn record(
         &mut self,
         gpu: &Gpu,

@@ -1,4 +1,4 @@
-//! The keyframes of a field: fused ones, and those that wait.
+//! The fused and the pending keyframes of a field.
 
 use crate::keyframe_signature::KeyframeSignature;
 use keyframe::Keyframe;
@@ -27,7 +27,7 @@ impl KeyframeQueue {
         self.fused.len() as u64 + self.n_removed
     }
 
-    /// Forgets a keyframe. If it was fused, its contribution to the field stays, but resuming does not need it.
+    /// Removes a keyframe. If it was fused, its effect on the field stays, but resuming does not need the keyframe.
     pub(super) fn remove(&mut self, camera: &str, stamp: Stamp) {
         self.pending.retain(|keyframe| keyframe.camera.as_ref() != camera || keyframe.stamp != stamp);
         let n_before = self.fused.len();

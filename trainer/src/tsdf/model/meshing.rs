@@ -70,8 +70,8 @@ impl Meshing {
         Ok(block_meshes)
     }
 
-    /// Meshes changed blocks if some blocks are in host memory: loads them with their neighbors into a small temporary
-    /// field, a batch at a time.
+    /// Meshes changed blocks if some blocks are in host memory: loads them and their neighbors, a batch at a time, into
+    /// a small temporary field.
     fn mesh_in_batches(
         &mut self,
         gpu: &Gpu,

@@ -43,7 +43,7 @@ impl TsdfModel {
         write_glb(&folder.join(MESH_GLB), &mesh)?;
         let blocks = folder.join(BLOCKS_FILE);
         let (mut state, arrays) = self.state()?;
-        // The other common options do not affect a field: equal fields give equal files, whatever the planned steps.
+        // Other common options do not affect a field. They are reset, so that equal fields give equal files.
         let common = CommonOptions { max_bytes: self.options.common.max_bytes, ..CommonOptions::default() };
         state["options"]["common"] = serde_json::to_value(common).map_err(|error| invalid_state(error.to_string()))?;
         let arrays = arrays.into_iter().map(deflated).collect::<std::io::Result<Vec<Array>>>();

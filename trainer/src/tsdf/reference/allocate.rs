@@ -1,5 +1,5 @@
-//! Twin of `allocate_blocks.wgsl`: finds the blocks that rays cross by a different method, from the faces they pass in
-//! order.
+//! Twin of `allocate_blocks.wgsl`. Uses a different method to find the blocks that a ray crosses: the sorted positions
+//! at which the ray passes block faces.
 
 use super::readings::{Reading, ray_of};
 use crate::tsdf::block::GridCoord;
@@ -55,12 +55,12 @@ pub fn required_blocks(depth: &DepthMap, readings: &[Reading], voxel_grid: &Voxe
     required
 }
 
-/// Whether a point is further than `margin` from every face of the blocks.
+/// Whether a point is farther than `margin` from every face of the blocks.
 fn is_clear_of_faces(point: &Vector3<f64>, margin: f64) -> bool {
     point.iter().all(|along| (margin..1.0 - margin).contains(&(along - along.floor())))
 }
 
-/// Intervals of the line between the faces it passes, as fractions of its length.
+/// Intervals between the faces that a line passes, as fractions of the line's length.
 fn intervals(begin: &Vector3<f64>, end: &Vector3<f64>) -> Vec<(f64, f64)> {
     let mut cuts = vec![0.0, 1.0];
     for axis in 0..3 {

@@ -1,4 +1,4 @@
-//! Twin of `cast_rays.wgsl`: finds the first crossing from outside to inside by small constant steps.
+//! Twin of `cast_rays.wgsl`: finds the first crossing from outside to inside with small constant steps.
 
 use crate::tsdf::block::{Blocks, block_of, voxel_ix};
 use crate::tsdf::chosen_grid::VoxelGrid;

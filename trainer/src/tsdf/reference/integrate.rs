@@ -1,4 +1,4 @@
-//! Twin of `integrate.wgsl`, applied to all given blocks; those outside the camera's view stay unchanged.
+//! Twin of `integrate.wgsl`, applied to all given blocks. Blocks outside the camera's view stay unchanged.
 
 use super::readings::{Reading, ray_of};
 use crate::tsdf::block::{GridCoord, N_VOXELS};
@@ -112,7 +112,7 @@ fn projected(point: &Point3<f64>, focal: [f64; 2], principal: [f64; 2], size_px:
     (point.z > 0.0 && inside).then_some(block_coord)
 }
 
-/// The four pixels around a position, clamped to the image, and the interpolation weights of the right and lower ones.
+/// The four pixels around a position, clamped to the image, and the weights of the right and lower pixels.
 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the image")]
 fn corners(position_px: [f64; 2], size_px: [u32; 2]) -> ([usize; 4], [f64; 2]) {
     let base = position_px.map(|along| (along - 0.5).floor());

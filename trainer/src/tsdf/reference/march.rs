@@ -11,7 +11,7 @@ const GRAY: f64 = 0.5;
 /// A vertex of a block's triangles.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Vertex {
-    /// The edge of the vertex: from this voxel, relative to the block's first one, to the next along the axis.
+    /// The edge of the vertex: its first voxel, relative to the block's first voxel, and its axis.
     pub between: (GridCoord, usize),
     /// Relative to the field's anchor, along the world's axes, meters.
     pub position_m: [f64; 3],
@@ -47,7 +47,7 @@ impl<'a> BlockNeighborhood<'a> {
         Self { block_coord, blocks: found }
     }
 
-    /// The block of a voxel given relative to this block's first one, -8 to 15, and the voxel's index in it.
+    /// The block that contains a voxel, and the voxel's index in it. `voxel` is relative to this block, -8 to 15.
     fn at(&self, voxel: GridCoord) -> Option<(&'a Block, usize)> {
         let [x, y, z] = voxel.map(|along| along.div_euclid(BLOCK_EDGE) + 1);
         let block = self.blocks[usize::try_from(9 * z + 3 * y + x).ok()?]?;
@@ -80,7 +80,7 @@ impl<'a> BlockNeighborhood<'a> {
         self.at(voxel).and_then(|(block, ix)| block.color_srgb(ix))
     }
 
-    /// Which corners of the cube that begins at `voxel` are inside; `None` if any was not observed.
+    /// Case of the cube that begins at `voxel`: bit c is set if corner c is inside; `None` if any was not observed.
     fn case_of(&self, voxel: GridCoord) -> Option<usize> {
         (0..8).try_fold(0, |case, corner| {
             let is_inside = self.distance(moved(voxel, corner))? < 0.0;
@@ -112,7 +112,7 @@ fn moved(voxel: GridCoord, corner: usize) -> GridCoord {
     std::array::from_fn(|axis| voxel[axis] + i32::from(corner >> axis & 1 == 1))
 }
 
-/// Extracts the triangles of a block; cubes with an unobserved corner have none.
+/// Extracts the triangles of a block. Cubes with an unobserved corner have no triangles.
 pub fn march(blocks: &Blocks, block_coord: GridCoord, voxel_m: f64) -> BlockTriangles {
     let around = BlockNeighborhood::new(blocks, block_coord);
     let mut triangles_of_block = BlockTriangles::default();

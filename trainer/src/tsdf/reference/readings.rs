@@ -9,7 +9,7 @@ use nalgebra::Vector3;
 pub struct Reading {
     /// Meters along z; 0 for invalid pixels.
     pub depth_m: f64,
-    /// The ray with z = 1 times the surface's unit normal.
+    /// Dot product of the ray (z = 1) and the unit surface normal.
     pub ray_dot_normal: f64,
 }
 
@@ -24,7 +24,7 @@ pub(super) fn ray_of(depth: &DepthMap, position_px: [f64; 2]) -> Vector3<f64> {
     Vector3::new(along(0), along(1), 1.0)
 }
 
-/// Which pixels are valid, and the orientation of their surface.
+/// Determines the valid pixels and the orientation of their surface.
 pub fn readings(depth: &DepthMap, voxel_grid: &VoxelGrid) -> Vec<Reading> {
     let [width, height] = depth.size_px.map(i64::from);
     (0..height).flat_map(|y| (0..width).map(move |x| [x, y])).map(|pixel| reading(depth, voxel_grid, pixel)).collect()
