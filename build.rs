@@ -3,8 +3,9 @@
 fn main() {
     println!("cargo::rerun-if-env-changed=MUJOCO_DYNAMIC_LINK_DIR");
     if std::env::var_os("CARGO_FEATURE_REALSENSE").is_some() {
-        // Next to the executable, and where `scripts/fetch-realsense.sh` puts the library. An installed RealSense SDK
-        // needs no path.
+        // librealsense contains its own LZ4, which the program must not replace by one of its own: see `drivers/build.rs`.
+        println!("cargo::rustc-link-arg=-Wl,--exclude-libs,ALL");
+        // Paths to the library from `scripts/fetch-realsense.sh`; an installed one is found without them.
         for folder in ["$ORIGIN", "$ORIGIN/../../.deps/realsense", "$ORIGIN/../../../.deps/realsense"] {
             println!("cargo::rustc-link-arg=-Wl,-rpath,{folder}");
         }

@@ -339,8 +339,13 @@ mod tests {
         let address = listener.local_addr().expect("bound");
         let other = std::thread::spawn(move || {
             let (mut stream, _) = listener.accept().expect("a client");
-            let n_read = stream.read(&mut [0; 4096]).expect("a request");
-            assert!(n_read > 0);
+            let mut request = Vec::new();
+            while !request.ends_with(b"\r\n\r\n") {
+                let mut part = [0; 4096];
+                let n_read = stream.read(&mut part).expect("a request");
+                assert!(n_read > 0);
+                request.extend(&part[..n_read]);
+            }
             stream.write_all(b"HTTP/1.1 404 Not Found\r\n\r\n").expect("sent");
         });
         let error_message = Viewer::connect(address, ViewerOptions::default()).expect_err("no WebSocket").to_string();

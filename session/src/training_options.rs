@@ -143,7 +143,7 @@ impl TrainingOptions {
         let is_known = |param: &Refine| is_other(param) || can_align(param) || can_learn(param);
         let Some(unknown) = self.refine.iter().find(|param| !is_known(param)) else { return Ok(()) };
         let known: Vec<&str> = Refine::ALL.iter().filter(|(_, param)| is_known(param)).map(|(name, _)| *name).collect();
-        let without = if available.depth { "" } else { " without depth before training" };
+        let without = if available.depth { "" } else { " without measured depth" };
         Err(Error::BadInput(format!(
             "--refine {}: the method {} cannot estimate this{without}; it supports {}",
             unknown.name(),
@@ -164,7 +164,7 @@ impl TrainingOptions {
         }
         let needs_depth = [Refine::Joints, Refine::DepthPose, Refine::DepthScale, Refine::Readout];
         if let (Some(param), false) = (needs_depth.into_iter().find(|param| has(*param)), available.depth) {
-            let message = "needs depth images that are available before training";
+            let message = "needs depth images measured by a camera";
             return Err(Error::BadInput(format!("--refine {}: {message}", param.name())));
         }
         if has(Refine::Joints) && !available.joints {

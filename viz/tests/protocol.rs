@@ -323,7 +323,7 @@ fn every_wire_field_is_documented_and_typed() {
     let folder = std::path::PathBuf::from(env!("CARGO_MANIFEST_DIR"));
     let docs = std::fs::read_to_string(folder.join("../docs/reference/protocol.md")).expect("the docs");
     let page = std::fs::read_to_string(folder.join("web/src/protocol.ts")).expect("the page's messages");
-    assert!(docs.contains(&format!("Version **{}**", viz::PROTOCOL_VERSION)));
+    assert!(docs.contains(&format!("version **{}** of the protocol", viz::PROTOCOL_VERSION)));
     assert!(page.contains(&format!("PROTOCOL_VERSION = {};", viz::PROTOCOL_VERSION)));
     for message in one_of_each() {
         let kind = message["type"].as_str().expect("a type");
