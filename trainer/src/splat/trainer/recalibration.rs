@@ -1,7 +1,8 @@
 //! Corrects the cameras of a model in training: the splats move along with the keyframes that show them.
 //!
 //! A splat that was trained on wrong poses lies where its keyframes agree most. Each keyframe would carry it to where the
-//! same pixel lies after the correction; the splat moves to the mean of these positions. Coefficients of spherical
+//! same pixel lies after the correction; the splat moves to the mean of these positions, weighted by how well the depth of
+//! each keyframe agrees with it. Coefficients of spherical
 //! harmonics are not rotated, because corrections are a few degrees at most.
 
 use super::SplatTrainer;
@@ -21,6 +22,10 @@ use std::sync::Arc;
 const MAX_KEYFRAMES: usize = 64;
 /// A splat belongs to the surface of a depth reading if it is at most this fraction of its depth away.
 const SURFACE_FRAC: f64 = 0.05;
+/// Depth error, as a fraction of the depth, at which the weight of a keyframe is halved.
+const AGREEMENT_FRAC: f64 = 0.001;
+/// Weight of a keyframe without a depth reading: it shows the splat unless something hides it.
+const WITHOUT_DEPTH: f64 = 1e-4;
 /// Parameters of single images, which stay enabled. Shared parameters are part of the alignment.
 const IMAGE_PARAMS: ParamSet = ParamSet::IMAGE_POSES.union(ParamSet::IMAGE_GAINS);
 
@@ -102,6 +107,13 @@ impl Pinhole {
     }
 }
 
+/// The reading at a pixel within the depth map, meters along z.
+#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "pixels within the image")]
+fn reading_m(depth: &DepthMap, px: [f64; 2]) -> f64 {
+    let [x, y] = px.map(|px| px as usize);
+    depth.depth_m[y * depth.size_px[0] as usize + x].into()
+}
+
 /// The motion of what one keyframe shows.
 struct Motion {
     before: Pinhole,
@@ -111,32 +123,21 @@ struct Motion {
     rotation: UnitQuaternion<f64>,
 }
 
-/// How a keyframe shows a point.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-enum Visibility {
-    /// Its image contains the position of the point; whether something hides the point is unknown.
-    InImage,
-    /// A depth reading confirms the surface.
-    OnSurface,
-}
-
 impl Motion {
-    /// How the keyframe shows a point, and where the correction moves it; `None` if the keyframe does not show it.
-    fn of_point(&self, point: &Point3<f64>) -> Option<(Visibility, Point3<f64>)> {
+    /// Where the correction moves a point, and the weight of this motion; `None` if the keyframe does not show the point.
+    fn of_point(&self, point: &Point3<f64>) -> Option<(Point3<f64>, f64)> {
         let (px, z) = self.before.project(point)?;
-        let reading = self.depth.as_ref().and_then(|(camera, depth)| {
+        let known = self.depth.as_ref().and_then(|(camera, depth)| {
             let (px, z) = camera.project(point)?;
-            #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "pixels within the image")]
-            let [x, y] = px.map(|px| px as usize);
-            let reading = f64::from(depth.depth_m[y * depth.size_px[0] as usize + x]);
-            (reading > 0.0).then_some((reading - z).abs() <= SURFACE_FRAC * z)
+            let reading = reading_m(depth, px);
+            (reading > 0.0).then_some((reading - z) / z)
         });
-        let visibility = match reading {
-            Some(true) => Visibility::OnSurface,
-            None => Visibility::InImage,
-            Some(false) => return None,
+        let weight = match known {
+            Some(error_frac) if error_frac.abs() > SURFACE_FRAC => return None,
+            Some(error_frac) => 1.0 / (1.0 + (error_frac / AGREEMENT_FRAC).powi(2)),
+            None => WITHOUT_DEPTH,
         };
-        Some((visibility, self.after.point(px, z)))
+        Some((self.after.point(px, z), weight))
     }
 }
 
@@ -159,28 +160,20 @@ fn motions<'a>(keyframes: &[CorrectedKeyframe], learned: impl Fn(&str) -> Option
     subset.map(motion).collect()
 }
 
-/// Position and rotation of a splat after the correction: the means over the keyframes that show it best, or those of the
-/// nearest camera if none does.
+/// Position and rotation of a splat after the correction: the weighted means over the keyframes that show it, or those of
+/// the nearest camera if none does.
 fn moved(motions: &[Motion], point: &Point3<f64>) -> Option<(Point3<f64>, UnitQuaternion<f64>)> {
-    let (mut best, mut n, mut sum) = (Visibility::InImage, 0.0, Vector3::zeros());
+    let (mut weights, mut shift) = (0.0, Vector3::zeros());
     let mut rotations = Quaternion::from_parts(0.0, Vector3::zeros());
     for motion in motions {
-        let Some((visibility, position)) = motion.of_point(point) else { continue };
-        if visibility < best {
-            continue;
-        }
-        if visibility > best {
-            (best, n, sum, rotations) =
-                (visibility, 0.0, Vector3::zeros(), Quaternion::from_parts(0.0, Vector3::zeros()));
-        }
+        let Some((position, weight)) = motion.of_point(point) else { continue };
         let rotation = motion.rotation.into_inner();
-        // Both signs are the same rotation.
-        rotations += if rotation.w < 0.0 { -rotation } else { rotation };
-        sum += position - point;
-        n += 1.0;
+        rotations += if rotation.w < 0.0 { -rotation } else { rotation } * weight; // Both signs are the same rotation.
+        shift += (position - point) * weight;
+        weights += weight;
     }
-    if n > 0.0 {
-        return Some((point + sum / n, UnitQuaternion::from_quaternion(rotations)));
+    if weights > 0.0 {
+        return Some((point + shift / weights, UnitQuaternion::from_quaternion(rotations)));
     }
     let distance =
         |motion: &&Motion| (motion.before.world_from_camera.translation.vector - point.coords).norm_squared();
@@ -228,8 +221,8 @@ mod tests {
         for mean in trainer.arrays().unwrap().means {
             let point = Point3::from(mean.map(f64::from));
             for (camera, depth) in &depths {
-                let Some(([x, y], z)) = camera.project(&point) else { continue };
-                let error = (f64::from(depth.depth_m[y as usize * depth.size_px[0] as usize + x as usize]) - z).abs();
+                let Some((px, z)) = camera.project(&point) else { continue };
+                let error = (reading_m(depth, px) - z).abs();
                 errors.extend((error < 0.1).then_some(error));
             }
         }
