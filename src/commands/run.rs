@@ -22,7 +22,7 @@ use session::run_folder::{self, CreatedFolders};
 use session::{
     AvailableData, Checkpoints, Clock, DecisionLog, EndingSession, Evaluator, Evaluators, FinishedModel, Limits, Live,
     LiveOptions, ModelViewer, Pace, REALIGN, Recovery, RefineSettings, RunDescription, RunFlags, ServedModel, Session,
-    Settings, StoredKeyframes, Viewers, checkpoints, methods_of, recovery,
+    Settings, StoredKeyframes, Viewers, checkpoints, corrected_rig, methods_of, recovery,
 };
 use std::collections::BTreeMap;
 use std::io::IsTerminal;
@@ -112,6 +112,8 @@ const STEPS: &str = "steps";
 const STEPS_PER_KEYFRAME: &str = "steps-per-keyframe";
 const SIM: &str = "sim";
 const LOCKSTEP: &str = "lockstep";
+/// Name of the rig file with the corrections of a run.
+const CORRECTED_RIG: &str = "corrected-rig.toml";
 const RECORD: &str = "record";
 
 /// Time for which the server stays up, so that connected clients receive the last status.
@@ -437,6 +439,7 @@ fn save(
     let is_recorded = input_result.recording_error.is_none();
     data_losses.extend(input_result.recording_error.map(|error| format!("the recording is incomplete: {error:#}")));
     data_losses.extend(damage.get().cloned());
+    let corrected = corrected_rigs(rig, &sessions, &folders)?;
     let stations = input_result.stations.as_ref().map_or(Vec::new(), |stations| stations.reports().to_vec());
     let ending = |(session, out): (Session, PathBuf)| EndingSession {
         details: RunDetails {
@@ -465,6 +468,10 @@ fn save(
     }
     publish_end(&hub, &models);
     listed?;
+    for (rig, file) in corrected {
+        corrected_rig::write(&rig, &file)?;
+        log::info!("rig file with the estimated corrections written to {}", file.display());
+    }
     if let Some(error) = input_result.input_error {
         return Err(anyhow::Error::new(error).context("a device failed"));
     }
@@ -472,6 +479,15 @@ fn save(
         return Err(InsufficientData(no_model_reason(n_keyframes, counts, rig)).into());
     }
     Ok((exit::from_losses(&data_losses), models))
+}
+
+/// The corrected rig files, with their paths, of the models whose cameras were corrected by alignment.
+fn corrected_rigs(rig: &Rig, sessions: &[Session], folders: &[PathBuf]) -> session::Result<Vec<(Rig, PathBuf)>> {
+    let aligned = sessions.iter().zip(folders).filter_map(|(session, folder)| {
+        let alignment = session.alignment().filter(|alignment| alignment.has_corrections())?;
+        Some(corrected_rig::corrected(rig, alignment).map(|rig| (rig, folder.join(CORRECTED_RIG))))
+    });
+    aligned.collect()
 }
 
 /// Camera and stamp of a keyframe that was evicted for lack of memory.

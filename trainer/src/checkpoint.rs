@@ -12,7 +12,7 @@ use std::path::Path;
 
 const MAGIC: [u8; 8] = *b"FRIGCKPT";
 /// Version of the layout and of the states of all methods.
-const VERSION: u32 = 4;
+const VERSION: u32 = 5;
 /// Length of magic, version and header length together.
 const PREAMBLE_BYTES: usize = 16;
 const CHECKSUM_BYTES: usize = 32;
