@@ -106,7 +106,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         report_arrival(args, &rig.arm.joints, &target, &last, began)?;
     }
     if motion.on_loss != OnLoss::Hold && !args.exit_on_arrival {
-        log::info!("holding the arm; support it before you press Ctrl-C, because the motors then release it");
+        log::info!("holding the arm; support it before you press Ctrl-C, because the motors then no longer hold it");
         mover.hold()?;
     }
     mover.bar.finish_and_clear();
