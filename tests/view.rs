@@ -197,7 +197,7 @@ fn view_matches_render() {
     }
     assert_eq!(client.request_picture(&start, None), client.request_picture(&start, Some("splat")));
     let refused = client.request_picture(&start, Some("mesh")).expect_err("no such model");
-    assert!(refused.contains("\"mesh\"") && refused.contains("splat, tsdf, nerf"), "{refused}");
+    assert!(refused.contains("\"mesh\"") && refused.contains("splat or tsdf or nerf"), "{refused}");
     assert_eq!(view.interrupt().code(), Some(0));
 
     check_view_without_cameras(folder);
