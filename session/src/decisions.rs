@@ -546,7 +546,7 @@ mod tests {
         let folder = tempfile::tempdir().expect("a folder");
         let text = written(folder.path());
         for (was, is, expected_error) in [
-            ("\"version\":3", "\"version\":9", "version 9, expected 3"),
+            ("\"version\":4", "\"version\":9", "version 9, expected 4"),
             ("\"version\"", "\"varsion\"", "line 1 has no version"),
             ("\"scale\"", "\"skale\"", "line 1: "),
             ("\"begin\":true", "\"begin\":false", "line 5: must be true"),
