@@ -20,8 +20,6 @@ const IDLE: Duration = Duration::from_millis(10);
 const SCORE_FRAC: f64 = 0.03;
 /// Polling period while waiting for a keyframe or a picture request.
 const POLL_PERIOD: Duration = Duration::from_millis(2);
-/// Maximum number of pictures that are drawn or queued before other work continues.
-const MAX_PICTURES: usize = 8;
 /// Maximum time for which pictures are drawn before other work continues.
 const MAX_RENDER_TIME: Duration = Duration::from_millis(100);
 
@@ -60,9 +58,6 @@ pub struct Live {
     /// Step of each session at which the next keyframe is due in lockstep.
     next_keyframe_at: Vec<u64>,
     budget: RenderBudget,
-    is_software: bool,
-    /// Whether pictures are queued on the GPU whose time is known only after the next training submit.
-    owes_training: bool,
     /// Session whose latest score is refreshed next.
     next_refreshed: usize,
     published: Option<Instant>,
@@ -76,7 +71,6 @@ pub struct Live {
 impl Live {
     /// Combines the parts. Training starts with the first call of [`Self::advance`].
     pub fn new(sessions: Vec<Session>, feed: Feed, hub: Hub, options: LiveOptions) -> Self {
-        let is_software = sessions.first().is_some_and(Session::is_software);
         Self {
             next_keyframe_at: vec![0; sessions.len()],
             sessions,
@@ -86,9 +80,7 @@ impl Live {
             start_keyframes: options.start_keyframes,
             keyframes: Vec::new(),
             n_evicted: 0,
-            budget: RenderBudget::new(is_software),
-            is_software,
-            owes_training: false,
+            budget: RenderBudget::default(),
             next_refreshed: 0,
             published: None,
             scoring_time: Duration::ZERO,
@@ -258,7 +250,6 @@ impl Live {
     /// Trains for one slice once there are enough keyframes. During an evaluation, scores one test image instead. Does
     /// not train if a requested picture may be drawn now.
     fn step(&mut self) -> crate::Result<()> {
-        let owes_training = std::mem::take(&mut self.owes_training);
         self.sessions.iter().try_for_each(Session::check_gpu)?;
         if !self.is_training() {
             return Ok(());
@@ -273,7 +264,7 @@ impl Live {
             self.hub.wait_for_request(IDLE);
             return Ok(());
         }
-        if !owes_training && self.is_render_pending() {
+        if self.is_render_pending() {
             return Ok(());
         }
         let is_watched = self.hub.n_clients() > 0;
@@ -290,9 +281,7 @@ impl Live {
         time_slices::train_next(&mut self.sessions, max_steps, || {
             budget.may_render() && hub.wait_for_request(Duration::ZERO)
         })?;
-        let picture_time = self.sessions.iter_mut().map(Session::take_picture_time).sum();
-        self.budget.add_training(before.elapsed().saturating_sub(picture_time));
-        self.budget.add_render(picture_time);
+        self.budget.add_training(before.elapsed());
         // Steps before this slice are complete, because at most one submit is in flight.
         self.ledger.completed(step_before);
         Ok(())
@@ -305,14 +294,11 @@ impl Live {
 
     /// Draws requested pictures as long as training keeps its share of the time.
     fn render(&mut self) -> crate::Result<()> {
-        let (started, mut n_queued) = (Instant::now(), 0);
+        let started = Instant::now();
         if !self.is_training() || self.is_idle() {
-            self.budget.refill(); // Training is idle, so drawing does not delay it.
+            self.budget = RenderBudget::default(); // Training is idle, so drawing does not delay it.
         }
-        for _ in 0..MAX_PICTURES {
-            if self.owes_training || started.elapsed() >= MAX_RENDER_TIME || !self.budget.may_render() {
-                break;
-            }
+        while started.elapsed() < MAX_RENDER_TIME && self.budget.may_render() {
             let Some(pending) = self.hub.next_request() else { break };
             if self.keyframes.is_empty() {
                 pending.fail("no keyframe yet");
@@ -330,17 +316,15 @@ impl Live {
             session.n_total_steps()?;
             self.budget.add_training(before.elapsed());
             let before = Instant::now();
-            match session.queue_render(&pending.request) {
+            match session.render(&pending.request) {
                 Ok(picture) => {
                     let n_keyframes = self.ledger.n_in_model(session.progress().step);
-                    pending.of_keyframes(n_keyframes as u64).deliver_when_ready(picture);
-                    n_queued += 1;
+                    pending.of_keyframes(n_keyframes as u64).deliver(picture);
                 }
                 Err(error) => pending.fail(&error.to_string()),
             }
             self.budget.add_render(before.elapsed());
         }
-        self.owes_training = n_queued > 0 && !self.is_software;
         Ok(())
     }
 

@@ -31,7 +31,7 @@ use scoreboard::Scoreboard;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use trainer::gpu::Gpu;
-use trainer::{FailedModel, Method, ModelKind, PendingPicture, Picture, Progress, RenderRequest};
+use trainer::{FailedModel, Method, ModelKind, Picture, Progress, RenderRequest};
 use training_time::TrainingTime;
 
 /// Approximate duration of a slice. The device is idle for a moment at the end of each slice.
@@ -189,17 +189,6 @@ impl Session {
         self.method.render(request)
     }
 
-    /// Starts to render a picture; see [`Method::queue_render`].
-    pub fn queue_render(&mut self, request: &RenderRequest) -> Result<PendingPicture, trainer::Error> {
-        self.persistence.log_render();
-        self.method.queue_render(request)
-    }
-
-    /// GPU time of queued pictures since the last call.
-    pub fn take_picture_time(&mut self) -> Duration {
-        self.method.take_picture_time()
-    }
-
     /// Waits for queued work and returns the total number of updates, including those of trials.
     pub fn n_total_steps(&mut self) -> crate::Result<u64> {
         Ok(self.method.n_total_steps()?)
@@ -298,11 +287,6 @@ impl Session {
     /// Marks the session as finished at the current training time.
     pub fn mark_finished(&mut self) {
         self.time.mark_finished();
-    }
-
-    /// Whether the adapter runs on the CPU.
-    pub fn is_software(&self) -> bool {
-        self.gpu.is_software()
     }
 
     /// Returns an error if the GPU failed.

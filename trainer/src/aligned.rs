@@ -9,7 +9,7 @@ use crate::checkpoint::{Checkpoint, PendingCheckpoint};
 use crate::gpu::{Gpu, PassTiming};
 use crate::model_metadata::{METADATA_FILE, read_metadata};
 use crate::model_options::{AlignTiming, CommonOptions};
-use crate::{Bounds, Error, Method, PendingPicture, Picture, Progress, RenderRequest};
+use crate::{Bounds, Error, Method, Picture, Progress, RenderRequest};
 use calibration::TrialReport;
 use calibration::{Alignment, AlignmentTask, alignment_step};
 use calibration::{CalibratedCamera, CameraCorrection, CameraRefinement};
@@ -19,7 +19,6 @@ use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
-use std::time::Duration;
 
 /// Key of the alignment state in a checkpoint. [`METADATA_KEY`] is the key of the alignment in `model.json`.
 const STATE_KEY: &str = "aligned";
@@ -316,14 +315,6 @@ impl<M: Recalibrate + 'static> Method for Aligned<M> {
 
     fn render(&mut self, request: &RenderRequest) -> Result<Picture, Error> {
         self.model.render(request)
-    }
-
-    fn queue_render(&mut self, request: &RenderRequest) -> Result<PendingPicture, Error> {
-        self.model.queue_render(request)
-    }
-
-    fn take_picture_time(&mut self) -> Duration {
-        self.model.take_picture_time()
     }
 
     fn set_watched(&mut self, watched: bool) {

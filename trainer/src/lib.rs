@@ -29,7 +29,6 @@ mod model_options;
 mod model_spec;
 pub mod nerf;
 pub mod optim;
-mod pending_picture;
 #[cfg(test)]
 mod random;
 mod registry;
@@ -55,6 +54,5 @@ pub use failed_model::FailedModel;
 pub use method::{Method, Progress};
 pub use model_options::{AlignTiming, CommonOptions, MethodOptions, ModelOptions};
 pub use model_spec::{LoadedModel, ModelSpec, Resumed, load, resume};
-pub use pending_picture::PendingPicture;
 pub use registry::ModelKind;
 pub use request::{Aabb, Picture, Projection, RenderRequest};

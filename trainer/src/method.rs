@@ -3,13 +3,12 @@
 use crate::bounds::Bounds;
 use crate::checkpoint::PendingCheckpoint;
 use crate::gpu::PassTiming;
-use crate::{Error, PendingPicture, Picture, RenderRequest};
+use crate::{Error, Picture, RenderRequest};
 use calibration::{Alignment, CalibratedCamera, TrialReport};
 use keyframe::Keyframe;
 use kinematics::Stamp;
 use std::path::Path;
 use std::sync::Arc;
-use std::time::Duration;
 
 /// Progress of training.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -64,15 +63,6 @@ pub trait Method {
     fn set_watched(&mut self, watched: bool);
     /// Renders a picture. If the model is empty, first initializes it as [`Method::seed`] does.
     fn render(&mut self, request: &RenderRequest) -> Result<Picture, Error>;
-    /// Starts to render a picture. Where the model can render on the GPU while it trains, this does not wait for the
-    /// picture.
-    fn queue_render(&mut self, request: &RenderRequest) -> Result<PendingPicture, Error> {
-        self.render(request).map(PendingPicture::ready)
-    }
-    /// GPU time of queued pictures since the last call, as far as it is known.
-    fn take_picture_time(&mut self) -> Duration {
-        Duration::ZERO
-    }
     /// PSNR of the requested picture against a keyframe's image of the same size, dB, computed on the GPU.
     /// Bit-identical to [`crate::eval::psnr`] of the 8-bit picture. `None` if the model does not support this, or not
     /// yet.

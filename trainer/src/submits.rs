@@ -3,7 +3,7 @@
 use crate::Error;
 use crate::gpu::{Gpu, PendingRead};
 use crate::method::submit_millis;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 /// Weight of the latest submit in the smoothed step time.
 const NEW_WEIGHT: f64 = 0.2;
@@ -17,10 +17,6 @@ pub(crate) struct Submits {
     step_millis: f64,
     /// Whether pictures are requested.
     is_watched: bool,
-    /// Time since which pictures are queued before the next submit.
-    pictures_since: Option<Instant>,
-    /// GPU time of queued pictures that was not taken yet.
-    picture_time: Duration,
 }
 
 #[derive(Debug)]
@@ -28,53 +24,26 @@ struct InFlight {
     counters: PendingRead,
     n_steps: u64,
     since: Instant,
-    has_pictures_before: bool,
 }
 
 impl Submits {
     pub(crate) fn new() -> Self {
-        Self {
-            in_flight: None,
-            idle_since: Instant::now(),
-            step_millis: 0.0,
-            is_watched: false,
-            pictures_since: None,
-            picture_time: Duration::ZERO,
-        }
+        Self { in_flight: None, idle_since: Instant::now(), step_millis: 0.0, is_watched: false }
     }
 
     /// Registers a submit that returns counters at its end. Recording of the submit began at `since`.
     pub(crate) fn begin(&mut self, counters: PendingRead, n_steps: u64, since: Instant) {
-        let pictures_since = self.pictures_since.take();
-        let (since, has_pictures_before) = (pictures_since.unwrap_or(since), pictures_since.is_some());
-        self.in_flight = Some(InFlight { counters, n_steps, since, has_pictures_before });
-    }
-
-    /// Records that a picture was queued before the next submit.
-    pub(crate) fn queue_picture(&mut self) {
-        self.pictures_since.get_or_insert_with(Instant::now);
-    }
-
-    /// GPU time of queued pictures since the last call: the excess duration of the submits after them.
-    pub(crate) fn take_picture_time(&mut self) -> Duration {
-        std::mem::take(&mut self.picture_time)
+        self.in_flight = Some(InFlight { counters, n_steps, since });
     }
 
     /// Waits for the submit in flight and returns its counters, if there is one.
     pub(crate) fn finish(&mut self, gpu: &Gpu) -> Result<Option<Vec<u32>>, Error> {
-        let Some(InFlight { counters, n_steps, since, has_pictures_before }) = self.in_flight.take() else {
-            return Ok(None);
-        };
+        let Some(InFlight { counters, n_steps, since }) = self.in_flight.take() else { return Ok(None) };
         let counters = counters.finish(gpu)?;
         let completed = Instant::now();
         let began = since.max(self.idle_since); // The previous submit may have been running at `since`.
         self.idle_since = completed;
         let millis = (completed - began).as_secs_f64() * 1e3 / n_steps.max(1) as f64;
-        if has_pictures_before && self.step_millis > 0.0 {
-            let excess_millis = (millis - self.step_millis).max(0.0) * n_steps as f64;
-            self.picture_time += Duration::from_secs_f64(excess_millis * 1e-3);
-            return Ok(Some(counters));
-        }
         self.step_millis = match self.step_millis {
             0.0 => millis,
             smoothed => (1.0 - NEW_WEIGHT) * smoothed + NEW_WEIGHT * millis,

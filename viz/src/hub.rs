@@ -2,7 +2,7 @@
 
 use crate::pose::row_major;
 use crate::protocol::{PictureHeader, ProjectionMessage};
-use crate::queue::{Outgoing, Queue, RenderJob, RenderedStage};
+use crate::queue::{Outgoing, Queue, RenderJob};
 use crate::updates::{KeyframePose, LiveImage, RunResult, SceneHint, Status};
 use crate::view_request::ViewRequest;
 use parking_lot::{Condvar, Mutex, MutexGuard};
@@ -10,7 +10,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use tokio::sync::{Notify, watch};
-use trainer::{PendingPicture, Picture, Projection, RenderRequest};
+use trainer::{Picture, Projection, RenderRequest};
 
 /// Handle shared by the training thread and a [`Server`](crate::Server). Clones refer to the same hub.
 #[derive(Clone, Debug, Default)]
@@ -127,17 +127,6 @@ impl Hub {
         self.queue().collect(client)
     }
 
-    /// Records the render time of a finished stage.
-    pub(crate) fn record_render_time(&self, job: &RenderJob, millis: f64) {
-        self.queue().record_render_time(job, millis);
-    }
-
-    /// Requests a stage again that could not be rendered.
-    pub(crate) fn retry(&self, job: RenderJob) {
-        self.queue().retry(job);
-        self.shared.work_arrived.notify_all();
-    }
-
     pub(crate) fn release(&self, client: u64) {
         self.queue().release(client);
         self.shared.work_arrived.notify_all();
@@ -193,14 +182,12 @@ impl PendingRender {
     }
 
     /// Sends the rendered picture to the client. Encoding happens on the server's threads.
-    pub fn deliver(self, picture: Picture) {
-        self.deliver_when_ready(PendingPicture::ready(picture));
-    }
-
-    /// Sends a picture to the client once the GPU has rendered it. The server's threads wait for it.
-    pub fn deliver_when_ready(mut self, picture: PendingPicture) {
-        let stage = RenderedStage { job: self.job.clone(), header: self.header(), started: self.started, picture };
-        self.enqueue_answer(Outgoing::Picture(Box::new(stage)));
+    pub fn deliver(mut self, picture: Picture) {
+        let header = self.header(&picture);
+        if header.last {
+            self.hub.queue().record_render_time(&self.job, header.render_millis);
+        }
+        self.enqueue_answer(Outgoing::Picture(Box::new((self.job.clone(), header, picture))));
     }
 
     /// Sends the client a one-sentence reason why this picture could not be rendered.
@@ -213,7 +200,7 @@ impl PendingRender {
         self.hub.queue().push_outgoing(self.job.client, outgoing);
     }
 
-    fn header(&self) -> PictureHeader {
+    fn header(&self, picture: &Picture) -> PictureHeader {
         let view_request = &self.job.view_request;
         PictureHeader {
             id: view_request.id,
@@ -221,7 +208,7 @@ impl PendingRender {
             n_stages: view_request.stages.len(),
             scale: view_request.stages[self.job.stage],
             last: self.job.stage + 1 == view_request.stages.len(),
-            size_px: self.request.size_px,
+            size_px: picture.size_px,
             full_size_px: view_request.request.size_px,
             world_from_camera: row_major(&view_request.request.world_from_camera),
             projection: projection_message(&view_request.request.projection),

@@ -25,8 +25,6 @@ pub(crate) enum PackError {
     #[error("a {width} x {height} depth map needs {needed} values but has {got}")]
     DepthLength { width: u32, height: u32, needed: usize, got: usize },
     #[error(transparent)]
-    Render(#[from] trainer::Error),
-    #[error(transparent)]
     Encode(#[from] JpegError),
     #[error("the JPEG file cannot be decoded: {0}")]
     Decode(#[from] image::ImageError),

@@ -4,9 +4,8 @@ use crate::protocol::PictureHeader;
 use crate::view_request::ViewRequest;
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
-use std::time::Instant;
 use tokio::sync::Notify;
-use trainer::PendingPicture;
+use trainer::Picture;
 
 /// Maximum number of pictures per client that are being rendered or sent. It limits rendering for slow clients.
 const MAX_UNSENT: usize = 2;
@@ -52,22 +51,11 @@ pub(crate) struct RenderJob {
     pub(crate) stage: usize,
 }
 
-/// A stage of a request, and its picture.
-#[derive(Debug)]
-pub(crate) struct RenderedStage {
-    pub(crate) job: RenderJob,
-    /// Does not yet describe the parts of the payload.
-    pub(crate) header: PictureHeader,
-    /// When rendering started.
-    pub(crate) started: Instant,
-    pub(crate) picture: PendingPicture,
-}
-
 /// A result to send to a client.
 #[derive(Debug)]
 pub(crate) enum Outgoing {
-    /// A stage that may still be rendering, and is not encoded yet.
-    Picture(Box<RenderedStage>),
+    /// A rendered stage that is not encoded yet. The header does not yet describe the parts of the payload.
+    Picture(Box<(RenderJob, PictureHeader, Picture)>),
     /// A stage that could not be rendered.
     Failed { id: u64, reason: String },
 }
@@ -137,15 +125,6 @@ impl Queue {
     /// Takes the oldest result from a client's outbox.
     pub(crate) fn collect(&mut self, client: u64) -> Option<Outgoing> {
         self.clients.get_mut(&client)?.outbox.pop_front()
-    }
-
-    /// Requests a stage again, unless the client has a newer request.
-    pub(crate) fn retry(&mut self, job: RenderJob) {
-        if let Some(waiting) = self.clients.get_mut(&job.client)
-            && waiting.view_request.is_none()
-        {
-            (waiting.view_request, waiting.next_stage) = (Some(job.view_request), job.stage);
-        }
     }
 
     /// Records that a stage was sent or will never be rendered.
@@ -235,23 +214,6 @@ mod tests {
         queue.view_request(a, view_request(2));
         queue.release(a);
         assert_eq!(drain(&mut queue), [(a, 2, 0), (a, 2, 1), (a, 2, 2)]);
-    }
-
-    #[test]
-    fn stage_that_was_not_rendered_is_requested_again() {
-        let mut queue = Queue::default();
-        let (a, _) = queue.join();
-        queue.view_request(a, view_request(1));
-        let mut jobs = Vec::new();
-        while let Some(job) = queue.take() {
-            queue.release(a);
-            jobs.push(job);
-        }
-        queue.retry(jobs[2].clone());
-        assert_eq!(drain(&mut queue), [(a, 1, 2)]);
-        queue.view_request(a, view_request(2));
-        queue.retry(jobs[2].clone());
-        assert_eq!(drain(&mut queue), [(a, 2, 0), (a, 2, 1), (a, 2, 2)], "the newer request is kept");
     }
 
     #[test]

@@ -6,7 +6,7 @@ use crate::broadcast::{LatestMessages, Received};
 use crate::clock::ServerClock;
 use crate::picture::{PackError, pack_picture};
 use crate::protocol::{ClientMessage, PROTOCOL_VERSION, ServerMessage};
-use crate::queue::{Outgoing, RenderedStage};
+use crate::queue::Outgoing;
 use crate::view_request::{DEFAULT_STAGES, InvalidRequest, MAX_SIZE_PX, ViewRequest};
 use axum::extract::ws::{Message, WebSocket};
 use futures_util::stream::{SplitSink, SplitStream};
@@ -148,7 +148,7 @@ struct Writer<'a> {
 /// A picture being encoded.
 struct EncodingTask {
     id: u64,
-    task: JoinHandle<Result<Option<Vec<u8>>, PackError>>,
+    task: JoinHandle<Result<Vec<u8>, PackError>>,
 }
 
 impl Writer<'_> {
@@ -169,7 +169,7 @@ impl Writer<'_> {
                 && let Some(outgoing) = self.server_context.hub.collect(self.client)
             {
                 match outgoing {
-                    Outgoing::Picture(stage) => encoding = Some(pack(*stage, self.server_context.hub.clone())),
+                    Outgoing::Picture(rendered) => encoding = Some(pack(rendered)),
                     Outgoing::Failed { id, reason } => {
                         let sent = self.send_error(Some(id), &reason).await;
                         self.server_context.hub.release(self.client);
@@ -232,8 +232,7 @@ impl Writer<'_> {
 
     async fn send_picture(&mut self, id: Option<u64>, packed: EncodingResult) -> SessionFlow {
         match packed {
-            Ok(Ok(Some(bytes))) => self.send(Message::binary(bytes)).await,
-            Ok(Ok(None)) => ControlFlow::Continue(()), // It is rendered again.
+            Ok(Ok(bytes)) => self.send(Message::binary(bytes)).await,
             Ok(Err(error)) => self.send_error(id, &error.to_string()).await,
             Err(error) => self.send_error(id, &error.to_string()).await,
         }
@@ -273,22 +272,14 @@ impl Writer<'_> {
     }
 }
 
-/// An encoded picture, `None` if it must be rendered again, or the reason why there is none.
-type EncodingResult = Result<Result<Option<Vec<u8>>, PackError>, JoinError>;
+/// An encoded picture, or the reason why there is none.
+type EncodingResult = Result<Result<Vec<u8>, PackError>, JoinError>;
 
-fn pack(stage: RenderedStage, hub: Hub) -> EncodingTask {
-    let id = stage.job.view_request.id;
+fn pack(rendered: Box<(crate::queue::RenderJob, crate::protocol::PictureHeader, trainer::Picture)>) -> EncodingTask {
+    let id = rendered.0.view_request.id;
     let task = tokio::task::spawn_blocking(move || {
-        let RenderedStage { job, mut header, started, picture } = stage;
-        let Some(picture) = picture.finish()? else {
-            hub.retry(job);
-            return Ok(None);
-        };
-        header.render_millis = started.elapsed().as_secs_f64() * 1e3;
-        if header.last {
-            hub.record_render_time(&job, header.render_millis);
-        }
-        pack_picture(&job.view_request, header, &picture).map(Some)
+        let (job, header, picture) = *rendered;
+        pack_picture(&job.view_request, header, &picture)
     });
     EncodingTask { id, task }
 }

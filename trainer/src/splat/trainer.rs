@@ -34,7 +34,7 @@ use crate::gpu::{Gpu, PassTiming};
 use crate::model_metadata::{METADATA_FILE, read_metadata};
 use crate::model_options::{MethodOptions, ModelOptions};
 use crate::view::projections;
-use crate::{Bounds, Error, Method, PendingPicture, Picture, Progress, Projection, RenderRequest};
+use crate::{Bounds, Error, Method, Picture, Progress, Projection, RenderRequest};
 use calibration::{Alignment, CalibratedCamera, CameraCorrection, Trial, TrialReport};
 use keyframe::{Keyframe, Split};
 use kinematics::Stamp;
@@ -47,7 +47,6 @@ use seeding::Seeding;
 use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
-use std::time::Duration;
 use view_set::ViewSet;
 
 /// Trains 3D Gaussian splats on keyframes.
@@ -200,17 +199,6 @@ impl SplatTrainer {
         let drawn = DrawnView { splats: self.trials.displayed(&self.model.splats), camera, background_srgb };
         self.renderer.picture(&mut self.recorder, drawn, depth)
     }
-
-    /// Queues a picture on the GPU.
-    pub(super) fn queue_on_gpu(&mut self, request: &RenderRequest) -> Result<PendingPicture, Error> {
-        self.seed_from_depth()?;
-        self.optimizer.submits.queue_picture();
-        projections::queue(request, |camera| {
-            let splats = self.trials.displayed(&self.model.splats);
-            let drawn = DrawnView { splats, camera, background_srgb: request.background_srgb };
-            self.renderer.queue_picture(&mut self.recorder, drawn, request.depth)
-        })
-    }
 }
 
 impl Method for SplatTrainer {
@@ -276,17 +264,6 @@ impl Method for SplatTrainer {
     fn render(&mut self, request: &RenderRequest) -> Result<Picture, Error> {
         self.seed_from_depth()?;
         projections::render(request, |camera| self.draw_view(camera, request.background_srgb, request.depth))
-    }
-
-    fn queue_render(&mut self, request: &RenderRequest) -> Result<PendingPicture, Error> {
-        match self.recorder.gpu.is_software() {
-            true => self.render(request).map(PendingPicture::ready), // Training needs the same processors.
-            false => self.queue_on_gpu(request),
-        }
-    }
-
-    fn take_picture_time(&mut self) -> Duration {
-        self.optimizer.submits.take_picture_time()
     }
 
     fn set_watched(&mut self, watched: bool) {

@@ -510,29 +510,3 @@ fn buffer_overflow_does_not_change_the_result() {
     assert_eq!((together.0, together.1), (N_STEPS, N_STEPS));
     assert!(one_by_one.2 == together.2);
 }
-
-/// Pictures that are queued on the GPU equal those that are waited for. If a buffer is too small, the picture is
-/// missing, and queueing it again renders it.
-#[test]
-fn queued_pictures_equal_rendered_ones() {
-    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
-    let mut cloud = synthetic_cloud(6000, 5);
-    cloud.log_scales.fill([1.5; 3]); // Every splat covers every image, which overflows the buffers.
-    let pinhole = request(pose(0));
-    let panorama = RenderRequest { projection: Projection::Equirectangular, ..pinhole.clone() };
-    for request in [pinhole, panorama] {
-        let start = || SplatTrainer::from_arrays(gpu.clone(), options(), &cloud).unwrap();
-        let rendered = start().render(&request).unwrap();
-        let mut trainer = start();
-        let queued: Vec<_> = (0..2).map(|_| trainer.queue_on_gpu(&request).unwrap()).collect();
-        for picture in queued {
-            assert!(picture.finish().unwrap().is_none(), "the buffers must be too small");
-        }
-        let queued: Vec<_> = (0..3).map(|_| trainer.queue_on_gpu(&request).unwrap()).collect();
-        for picture in queued {
-            let picture = picture.finish().unwrap().expect("the buffers were enlarged");
-            assert_eq!(picture.size_px, rendered.size_px);
-            assert!(picture.rgba_srgb == rendered.rgba_srgb && picture.depth_m == rendered.depth_m);
-        }
-    }
-}

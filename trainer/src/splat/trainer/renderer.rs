@@ -2,14 +2,12 @@
 
 use super::products::{self, Products};
 use super::recorder::Recorder;
-use crate::gpu::{Buffer, Gpu, PendingRead, Pipeline};
+use crate::gpu::{Buffer, Gpu, Pipeline};
 use crate::splat::buffers::{ImageBuffers, Scratch, ScratchSize, SplatBuffers, n_bins, n_tiles};
 use crate::splat::kernels::DrawPipelines;
 use crate::splat::params::{Camera, Supervision, View, status};
 use crate::splat::passes::ViewPasses;
-use crate::{Error, PendingPicture, Picture};
-use parking_lot::Mutex;
-use std::sync::Arc;
+use crate::{Error, Picture};
 
 /// Minimum capacity of the bin lists, in entries.
 const MIN_ENTRIES: u32 = 1 << 14;
@@ -25,8 +23,6 @@ pub(super) struct Renderer {
     background: Buffer,
     /// Buffer for images uploaded for comparison, kept for reuse.
     compared: Option<Buffer>,
-    /// Counters of a queued picture for which a buffer was too small.
-    overflow: Arc<Mutex<Option<Vec<u32>>>>,
 }
 
 /// A view to draw.
@@ -60,7 +56,6 @@ impl Renderer {
             view: gpu.uniform_with("splat.draw_view", &<View as bytemuck::Zeroable>::zeroed()),
             background: gpu.uniform_with("splat.background", &<Supervision as bytemuck::Zeroable>::zeroed()),
             compared: None,
-            overflow: Arc::default(),
         })
     }
 
@@ -73,30 +68,6 @@ impl Renderer {
     ) -> Result<Picture, Error> {
         let size_px = drawn.camera.size_px;
         self.draw(recorder, drawn, ReadParts::Picture { depth }, |parts| Picture::from_parts(size_px, parts))
-    }
-
-    /// Queues a picture on the GPU without waiting for it.
-    pub(super) fn queue_picture(
-        &mut self,
-        recorder: &mut Recorder,
-        drawn: DrawnView<'_>,
-        depth: bool,
-    ) -> Result<PendingPicture, Error> {
-        let counters = self.overflow.lock().take();
-        if let Some(counters) = counters {
-            self.grow_scratch(recorder, &counters)?;
-            clear_failure(&recorder.gpu, &self.status);
-        }
-        let size_px = drawn.camera.size_px;
-        let read = self.submit(recorder, drawn, ReadParts::Picture { depth })?;
-        let (gpu, overflow) = (recorder.gpu.clone(), self.overflow.clone());
-        Ok(PendingPicture::new(move || {
-            let (counters, picture) = finish_draw(read, &gpu, |parts| Picture::from_parts(size_px, parts))?;
-            if picture.is_none() {
-                *overflow.lock() = Some(counters);
-            }
-            Ok(picture)
-        }))
     }
 
     /// Draws a picture and compares it with an image of the same size.
@@ -139,13 +110,40 @@ impl Renderer {
     fn draw<R>(
         &mut self,
         recorder: &mut Recorder,
-        drawn: DrawnView<'_>,
+        DrawnView { splats, camera, background_srgb: [red, green, blue] }: DrawnView<'_>,
         parts: ReadParts<'_>,
         take: impl Fn(&[&[u8]]) -> R,
     ) -> Result<R, Error> {
+        let size_px = camera.size_px;
+        recorder.gpu.write(&self.view, 0, bytemuck::bytes_of(&camera.view()));
+        let background = Supervision { background_srgb: [red, green, blue, 0.0], ..bytemuck::Zeroable::zeroed() };
+        recorder.gpu.write(&self.background, 0, bytemuck::bytes_of(&background));
         loop {
-            let read = self.submit(recorder, drawn, parts)?;
-            let (counters, taken) = finish_draw(read, &recorder.gpu, &take)?;
+            self.reserve_view(recorder, splats.capacity, size_px, false)?;
+            reserve_image(recorder, &mut self.image_buffers, size_px, false)?;
+            let (status, view, image_buffers) =
+                (&self.status, &self.view, self.image_buffers.as_ref().ok_or(Error::DeviceLost)?);
+            let Recorder { gpu, passes: list } = recorder;
+            write_n_splats(gpu, status, splats.n_splats);
+            let passes = ViewPasses { gpu, splats, scratch: self.scratch()?, image_buffers, status, view, size_px };
+            passes.draw(list, &self.pipelines);
+            passes.finish(list, &self.pipelines, &self.background);
+            let mut read = vec![(status, 4 * status::LEN)];
+            match parts {
+                ReadParts::Picture { depth } => {
+                    let depths = depth.then_some(&image_buffers.depths);
+                    read.extend(Picture::buffers(size_px, &image_buffers.pixels, depths));
+                }
+                ReadParts::Comparison { score, image } => {
+                    let n_bytes = products::record(gpu, list, score, (view, image_buffers), size_px, image);
+                    read.push((&image_buffers.products, n_bytes));
+                }
+            }
+            let (counters, taken) = list.submit_reading(gpu, &read).finish_with(gpu, |parts| {
+                let counters: Vec<u32> = bytemuck::pod_collect_to_vec(parts[0]);
+                let taken = (counters[status::FAILED] == 0).then(|| take(&parts[1..]));
+                (counters, taken)
+            })?;
             if let Some(taken) = taken {
                 return Ok(taken);
             }
@@ -154,40 +152,6 @@ impl Renderer {
             }
             clear_failure(&recorder.gpu, &self.status);
         }
-    }
-
-    /// Submits the passes that draw a view, followed by a read-back of its counters and the requested parts.
-    fn submit(
-        &mut self,
-        recorder: &mut Recorder,
-        DrawnView { splats, camera, background_srgb: [red, green, blue] }: DrawnView<'_>,
-        parts: ReadParts<'_>,
-    ) -> Result<PendingRead, Error> {
-        let size_px = camera.size_px;
-        recorder.gpu.write(&self.view, 0, bytemuck::bytes_of(&camera.view()));
-        let background = Supervision { background_srgb: [red, green, blue, 0.0], ..bytemuck::Zeroable::zeroed() };
-        recorder.gpu.write(&self.background, 0, bytemuck::bytes_of(&background));
-        self.reserve_view(recorder, splats.capacity, size_px, false)?;
-        reserve_image(recorder, &mut self.image_buffers, size_px, false)?;
-        let (status, view, image_buffers) =
-            (&self.status, &self.view, self.image_buffers.as_ref().ok_or(Error::DeviceLost)?);
-        let Recorder { gpu, passes: list } = recorder;
-        write_n_splats(gpu, status, splats.n_splats);
-        let passes = ViewPasses { gpu, splats, scratch: self.scratch()?, image_buffers, status, view, size_px };
-        passes.draw(list, &self.pipelines);
-        passes.finish(list, &self.pipelines, &self.background);
-        let mut read = vec![(status, 4 * status::LEN)];
-        match parts {
-            ReadParts::Picture { depth } => {
-                let depths = depth.then_some(&image_buffers.depths);
-                read.extend(Picture::buffers(size_px, &image_buffers.pixels, depths));
-            }
-            ReadParts::Comparison { score, image } => {
-                let n_bytes = products::record(gpu, list, score, (view, image_buffers), size_px, image);
-                read.push((&image_buffers.products, n_bytes));
-            }
-        }
-        Ok(list.submit_reading(gpu, &read))
     }
 
     /// The scratch buffers, which must be reserved first.
@@ -262,19 +226,6 @@ impl Renderer {
         self.scratch = Some((size, made?));
         Ok(())
     }
-}
-
-/// Waits for the counters of a drawn view, and for its parts unless a buffer was too small.
-fn finish_draw<R>(
-    read: PendingRead,
-    gpu: &Gpu,
-    take: impl FnOnce(&[&[u8]]) -> R,
-) -> Result<(Vec<u32>, Option<R>), Error> {
-    read.finish_with(gpu, |parts| {
-        let counters: Vec<u32> = bytemuck::pod_collect_to_vec(parts[0]);
-        let taken = (counters[status::FAILED] == 0).then(|| take(&parts[1..]));
-        (counters, taken)
-    })
 }
 
 /// Reserves buffers for a picture of this size, including its gradients if `learned`.
