@@ -664,8 +664,12 @@ impl Args {
 
     /// Recordings and lockstep simulations wait for the trainer; everything else runs in real time.
     fn pace(&self, rig: &Rig) -> Result<Pace, BadArgument> {
-        let simulated = self.sim || rig.arm.driver == ArmDriver::Sim;
-        if (self.from.is_some() && !self.real_time) || (simulated && rig.sim.lockstep) {
+        let is_simulated = self.sim || rig.arm.driver == ArmDriver::Sim;
+        let is_lockstep = match self.from {
+            Some(_) => !self.real_time,
+            None => is_simulated && rig.sim.lockstep,
+        };
+        if is_lockstep {
             let steps_per_keyframe = self.steps_per_keyframe.unwrap_or(DEFAULT_STEPS_PER_KEYFRAME);
             return Ok(Pace::Lockstep { steps_per_keyframe });
         }
