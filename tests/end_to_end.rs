@@ -556,11 +556,29 @@ fn wrong_hand_eye_calibration_is_corrected() {
     let args = ["train", "scan.mcap", "--rig", "wrong.toml", "--refine", "auto", "--steps", "8", "--out", "out"];
     let printed = events(folder, &[&args[..], &["--write-rig", "found/rig.toml", "--json"]].concat());
     assert_eq!(printed.last().expect("events")["event"], "done");
-    let (found_m, found) = hand_eye(&folder.join("found/rig.toml"));
-    let dot: f64 = found.iter().zip(&right).map(|(found, right)| found * right).sum();
-    let degrees = 2.0 * dot.abs().min(1.0).acos().to_degrees();
-    let mm = 1e3 * found_m.iter().zip(&right_m).map(|(found, right)| (found - right).powi(2)).sum::<f64>().sqrt();
+    let remaining = |file: &str| {
+        let (found_m, found) = hand_eye(&folder.join(file));
+        let dot: f64 = found.iter().zip(&right).map(|(found, right)| found * right).sum();
+        let squares = found_m.iter().zip(&right_m).map(|(found, right)| (found - right).powi(2));
+        (2.0 * dot.abs().min(1.0).acos().to_degrees(), 1e3 * squares.sum::<f64>().sqrt())
+    };
+    let (degrees, mm) = remaining("found/rig.toml");
     assert!(degrees < MAX_REMAINING_DEGREES && mm < MAX_REMAINING_MM, "{degrees:.4} degrees, {mm:.3} mm left");
+
+    // In real time, while the keyframes arrive. The decision log reproduces the moment of the correction.
+    let args = ["run", "wrong.toml", "--from", "scan.mcap", "--real-time", "--seconds", "20", "--refine", "extrinsics"];
+    let outputs = ["--max-splats", "3000", "--listen", "127.0.0.1:0", "--out", "live", "--json"];
+    let live = events(folder, &[&args[..], &outputs[..]].concat()).pop().expect("events");
+    let (degrees, mm) = remaining("live/corrected-rig.toml");
+    assert!(
+        degrees < 2.0 * MAX_REMAINING_DEGREES && mm < 2.0 * MAX_REMAINING_MM,
+        "{degrees:.4} degrees, {mm:.3} mm left"
+    );
+    let log = std::fs::read_to_string(folder.join("live/decisions.jsonl")).expect("a log");
+    assert!(log.contains("\"align\":true"), "{log}");
+    let args = ["train", "scan.mcap", "--rig", "wrong.toml", "--replay-decisions", "live/decisions.jsonl"];
+    let again = events(folder, &[&args[..], &["--out", "replayed", "--json"]].concat()).pop().expect("events");
+    assert_eq!((&again["checkpoint_sha256"], &again["steps"]), (&live["checkpoint_sha256"], &live["steps"]));
 
     let report = std::fs::read_to_string(folder.join("out/report.json")).expect("a report");
     let report: Value = serde_json::from_str(&report).expect("JSON");

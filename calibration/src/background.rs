@@ -63,6 +63,11 @@ impl AlignmentTask {
         matches!(self.state, TaskState::Done)
     }
 
+    /// Whether alignment has ended and its result was not taken yet.
+    pub fn has_result(&self) -> bool {
+        matches!(&self.state, TaskState::Running(thread) if thread.is_finished())
+    }
+
     /// Requests another alignment. Its result replaces the latest one.
     pub fn request_again(&mut self) {
         self.state = TaskState::Requested;

@@ -9,7 +9,7 @@ use nalgebra::{Translation3, UnitQuaternion, Vector3};
 use std::path::{Path, PathBuf};
 
 /// Value of `source` for a corrected time offset.
-const SOURCE: &str = "train --write-rig";
+const SOURCE: &str = "registration of keyframes";
 
 /// The rig with all corrections applied. Per-image pose corrections have no key in a rig file and are left out.
 pub fn corrected(rig: &Rig, alignment: &Alignment) -> crate::Result<Rig> {

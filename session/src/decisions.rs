@@ -1,4 +1,5 @@
-//! The log of timing-dependent decisions: at which step each keyframe was added or removed, and when training ended.
+//! The log of timing-dependent decisions: at which step each keyframe was added or removed, when the result of an
+//! alignment was applied, and when training ended.
 //!
 //! One JSON object per line, see `docs/reference/files.md`. The log contains steps but no times, so that replaying it
 //! with the same data gives the same model.
@@ -17,7 +18,7 @@ use std::sync::mpsc::{SyncSender, sync_channel};
 use std::thread::JoinHandle;
 use trainer::ModelOptions;
 
-const VERSION: u64 = 3;
+const VERSION: u64 = 4;
 /// Name of the log in the run folder.
 const FILE: &str = "decisions.jsonl";
 /// Maximum number of decisions that wait to be written. Training waits while this queue is full.
@@ -110,6 +111,8 @@ pub enum Decision {
     Seed(True),
     /// Training on the keyframes so far was started, but no update was made before the next keyframe was added.
     Begin(True),
+    /// The result of an alignment in the background was applied.
+    Align(True),
     /// A checkpoint was taken at this step.
     Checkpoint(True),
     /// Training ended.
@@ -266,6 +269,12 @@ impl DecisionLog {
         self.log_activity(step);
         let removed_keyframe = Removed { camera: camera.to_owned(), stamp_nanos: stamp.0 };
         self.write(Line::Entry(Entry { step, decision: Decision::Remove(removed_keyframe) }));
+    }
+
+    /// Logs that the result of an alignment was applied after this many steps.
+    pub fn aligned(&mut self, step: u64) {
+        self.log_activity(step);
+        self.write(Line::Entry(Entry { step, decision: Decision::Align(True) }));
     }
 
     /// Records that a picture was drawn.
@@ -537,7 +546,7 @@ mod tests {
         let folder = tempfile::tempdir().expect("a folder");
         let text = written(folder.path());
         for (was, is, expected_error) in [
-            ("\"version\":3", "\"version\":9", "version 9, expected 3"),
+            ("\"version\":4", "\"version\":9", "version 9, expected 4"),
             ("\"version\"", "\"varsion\"", "line 1 has no version"),
             ("\"scale\"", "\"skale\"", "line 1: "),
             ("\"begin\":true", "\"begin\":false", "line 5: must be true"),

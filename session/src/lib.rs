@@ -77,6 +77,6 @@ pub use session::{EndingSession, Evaluators, FinishedModel, Limits, Session, Tra
 pub use stored_keyframes::StoredKeyframes;
 pub use table::Table;
 pub use training::{TrainingPlan, check_before_data, drive, limits, model_specs, train};
-pub use training_options::{AvailableData, LIVE_ALIGNMENT_KEYFRAMES, REALIGN, Refine, RefineSettings, TrainingOptions};
+pub use training_options::{AvailableData, REALIGN, Refine, RefineSettings, TrainingOptions};
 pub use viewer::{ModelViewer, ServedModel};
 pub use viewers::Viewers;

@@ -9,6 +9,7 @@ use capture::{Change, Feed, FeedItem, InputResult};
 use keyframe::{Keyframe, Split};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
+use trainer::AlignTiming;
 use viz::{Hub, KeyframePose, ModelStatus, Status};
 
 /// Period of status messages.
@@ -32,6 +33,16 @@ pub enum Pace {
         /// Steps between two keyframes.
         steps_per_keyframe: u64,
     },
+}
+
+impl Pace {
+    /// When the cameras are aligned.
+    pub fn align_timing(self) -> AlignTiming {
+        match self {
+            Self::RealTime => AlignTiming::RealTime,
+            Self::Lockstep { .. } => AlignTiming::Lockstep,
+        }
+    }
 }
 
 /// A live run.
@@ -89,8 +100,22 @@ impl Live {
         self
     }
 
+    /// Publishes the keyframes with the corrections of the first model.
     fn publish_keyframes(&self) {
-        self.hub.set_keyframes(self.keyframes.iter().map(|keyframe| frustum(keyframe)).collect());
+        let session = &self.sessions[0];
+        self.hub.set_keyframes(self.keyframes.iter().map(|keyframe| frustum(session, keyframe)).collect());
+    }
+
+    /// Applies the results of alignments that are ready.
+    fn apply_alignments(&mut self) -> crate::Result<()> {
+        let mut is_applied = false;
+        for session in &mut self.sessions {
+            is_applied |= session.poll_alignment(false)?;
+        }
+        if is_applied {
+            self.publish_keyframes();
+        }
+        Ok(())
     }
 
     /// Whether the run is over: a limit was reached or cannot be reached, the devices failed, or the input ended
@@ -162,6 +187,7 @@ impl Live {
         if self.is_scoring() {
             return Ok(());
         }
+        self.apply_alignments()?;
         if let Some(first_image) = self.feed.first_image() {
             self.sessions.iter_mut().for_each(|session| session.start_clock(first_image));
         }
@@ -447,10 +473,10 @@ fn model_status(session: &Session) -> ModelStatus {
     }
 }
 
-fn frustum(keyframe: &Keyframe) -> KeyframePose {
+fn frustum(session: &Session, keyframe: &Keyframe) -> KeyframePose {
     KeyframePose {
         camera: keyframe.camera.clone(),
-        world_from_camera: keyframe.world_from_camera,
+        world_from_camera: session.aligned_pose(keyframe),
         size_px: keyframe.size_px,
         focal_px: keyframe.focal_px,
         principal_px: keyframe.principal_px,

@@ -24,7 +24,7 @@ use crate::recovery::Recovery;
 use calibration::Alignment;
 use capture::Stop;
 use keyframe::Keyframe;
-use kinematics::Stamp;
+use kinematics::{Stamp, Transform};
 use persistence::Persistence;
 use reporter::Reporter;
 use scoreboard::Scoreboard;
@@ -228,6 +228,22 @@ impl Session {
         let n = self.method.step(max_steps.min(left))?;
         gpu_loss::lose_when_due(&self.gpu, self.progress().step);
         Ok(n)
+    }
+
+    /// Applies the result of an alignment in the background if it is ready, or waits for it if `wait`. Returns whether
+    /// a result was applied.
+    pub fn poll_alignment(&mut self, wait: bool) -> crate::Result<bool> {
+        let is_applied = self.method.poll_alignment(wait)?;
+        if is_applied {
+            self.persistence.log_alignment(self.method.as_mut())?;
+        }
+        Ok(is_applied)
+    }
+
+    /// Pose of a keyframe's camera with the corrections of alignment.
+    pub fn aligned_pose(&self, keyframe: &Keyframe) -> Transform {
+        let correction = self.method.alignment().and_then(|alignment| alignment.corrections.get(&*keyframe.camera));
+        correction.map_or(keyframe.world_from_camera, |correction| correction.apply(keyframe).world_from_camera)
     }
 
     /// Trains for one time slice on a shared device, at most `max_steps` steps. Queued work is complete when this

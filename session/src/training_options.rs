@@ -101,10 +101,6 @@ pub struct AvailableData {
     pub depth: bool,
 }
 
-/// Numbers of keyframes at which a live run registers its keyframes. At the first number, about four of them are
-/// validation images.
-pub const LIVE_ALIGNMENT_KEYFRAMES: [usize; 4] = [32, 64, 128, 256];
-
 impl TrainingOptions {
     /// The requested scene models; `None` if the flag is not given.
     pub fn methods(&self) -> Option<&[ModelKind]> {

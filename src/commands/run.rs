@@ -20,10 +20,9 @@ use session::methods::{self, COUNT};
 use session::next_commands::{DataSource, quoted};
 use session::run_folder::{self, CreatedFolders};
 use session::{
-    AvailableData, Checkpoints, Clock, DecisionLog, EndingSession, Evaluator, Evaluators, FinishedModel,
-    LIVE_ALIGNMENT_KEYFRAMES, Limits, Live, LiveOptions, ModelViewer, Pace, REALIGN, Recovery, RefineSettings,
-    RunDescription, RunFlags, ServedModel, Session, Settings, StoredKeyframes, Viewers, checkpoints, methods_of,
-    recovery,
+    AvailableData, Checkpoints, Clock, DecisionLog, EndingSession, Evaluator, Evaluators, FinishedModel, Limits, Live,
+    LiveOptions, ModelViewer, Pace, REALIGN, Recovery, RefineSettings, RunDescription, RunFlags, ServedModel, Session,
+    Settings, StoredKeyframes, Viewers, checkpoints, corrected_rig, methods_of, recovery,
 };
 use std::collections::BTreeMap;
 use std::io::IsTerminal;
@@ -113,6 +112,8 @@ const STEPS: &str = "steps";
 const STEPS_PER_KEYFRAME: &str = "steps-per-keyframe";
 const SIM: &str = "sim";
 const LOCKSTEP: &str = "lockstep";
+/// Name of the rig file with the corrections of a run.
+const CORRECTED_RIG: &str = "corrected-rig.toml";
 const RECORD: &str = "record";
 
 /// Time for which the server stays up, so that connected clients receive the last status.
@@ -284,7 +285,7 @@ pub(super) fn start(
     let pace = args.pace(&rig)?;
     let gpu = open_gpu()?;
     let RefineSettings { align, with_scene: cameras } = training.refining_live(available, gpu.is_software())?;
-    let common = CommonOptions { cameras, align, align_at_keyframes: LIVE_ALIGNMENT_KEYFRAMES.to_vec(), ..common };
+    let common = CommonOptions { cameras, align, align_timing: pace.align_timing(), ..common };
     let models: Vec<Resumed> = match previous {
         Some(previous) => vec![trainer::resume(gpu.clone(), &previous.checkpoint, &previous.keyframes)?],
         None => {
@@ -438,6 +439,7 @@ fn save(
     let is_recorded = input_result.recording_error.is_none();
     data_losses.extend(input_result.recording_error.map(|error| format!("the recording is incomplete: {error:#}")));
     data_losses.extend(damage.get().cloned());
+    let corrected = corrected_rigs(rig, &sessions, &folders)?;
     let stations = input_result.stations.as_ref().map_or(Vec::new(), |stations| stations.reports().to_vec());
     let ending = |(session, out): (Session, PathBuf)| EndingSession {
         details: RunDetails {
@@ -466,6 +468,10 @@ fn save(
     }
     publish_end(&hub, &models);
     listed?;
+    for (rig, file) in corrected {
+        corrected_rig::write(&rig, &file)?;
+        log::info!("rig file with the estimated corrections written to {}", file.display());
+    }
     if let Some(error) = input_result.input_error {
         return Err(anyhow::Error::new(error).context("a device failed"));
     }
@@ -473,6 +479,15 @@ fn save(
         return Err(InsufficientData(no_model_reason(n_keyframes, counts, rig)).into());
     }
     Ok((exit::from_losses(&data_losses), models))
+}
+
+/// The corrected rig files, with their paths, of the models whose cameras were corrected by alignment.
+fn corrected_rigs(rig: &Rig, sessions: &[Session], folders: &[PathBuf]) -> session::Result<Vec<(Rig, PathBuf)>> {
+    let aligned = sessions.iter().zip(folders).filter_map(|(session, folder)| {
+        let alignment = session.alignment().filter(|alignment| alignment.has_corrections())?;
+        Some(corrected_rig::corrected(rig, alignment).map(|rig| (rig, folder.join(CORRECTED_RIG))))
+    });
+    aligned.collect()
 }
 
 /// Camera and stamp of a keyframe that was evicted for lack of memory.
@@ -649,8 +664,12 @@ impl Args {
 
     /// Recordings and lockstep simulations wait for the trainer; everything else runs in real time.
     fn pace(&self, rig: &Rig) -> Result<Pace, BadArgument> {
-        let simulated = self.sim || rig.arm.driver == ArmDriver::Sim;
-        if (self.from.is_some() && !self.real_time) || (simulated && rig.sim.lockstep) {
+        let is_simulated = self.sim || rig.arm.driver == ArmDriver::Sim;
+        let is_lockstep = match self.from {
+            Some(_) => !self.real_time,
+            None => is_simulated && rig.sim.lockstep,
+        };
+        if is_lockstep {
             let steps_per_keyframe = self.steps_per_keyframe.unwrap_or(DEFAULT_STEPS_PER_KEYFRAME);
             return Ok(Pace::Lockstep { steps_per_keyframe });
         }

@@ -1,14 +1,14 @@
-//! A scene model that restarts with aligned cameras.
+//! A scene model whose cameras are aligned while it trains.
 //!
-//! Alignment is requested when the model is created and runs in parallel with training. Its result is applied a planned
-//! number of steps after alignment began. If the result contains corrections, the model restarts and trains again on
-//! corrected keyframes, because a model trained on wrong poses would need correction, too. In a live run, alignment is
-//! repeated as more keyframes arrive, and the model restarts only if the corrections changed noticeably.
+//! Alignment runs in parallel with training, once or repeatedly as keyframes arrive. Its result is applied a fixed number
+//! of steps after it began, so that a seed gives one result; in real time, it is applied when the caller asks for it
+//! ([`Method::poll_alignment`]), so that training never waits. A result that changes the corrections replaces the
+//! keyframes; the model moves along with them or restarts, see [`Recalibrate`].
 
 use crate::checkpoint::{Checkpoint, PendingCheckpoint};
 use crate::gpu::{Gpu, PassTiming};
 use crate::model_metadata::{METADATA_FILE, read_metadata};
-use crate::model_options::CommonOptions;
+use crate::model_options::{AlignTiming, CommonOptions};
 use crate::{Bounds, Error, Method, Picture, Progress, RenderRequest};
 use calibration::TrialReport;
 use calibration::{Alignment, AlignmentTask, alignment_step};
@@ -16,7 +16,7 @@ use calibration::{CalibratedCamera, CameraCorrection, CameraRefinement};
 use keyframe::{Keyframe, Split};
 use kinematics::Stamp;
 use serde::{Deserialize, Serialize};
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
 
@@ -24,12 +24,29 @@ use std::sync::Arc;
 const STATE_KEY: &str = "aligned";
 const METADATA_KEY: &str = "alignment";
 
-/// A model that can restart.
-pub trait Restartable: Method {
-    /// Discards all keyframes and all training, but may keep compiled kernels. Keyframes that are pushed afterwards
-    /// include the corrections of `alignment`.
-    fn restart(&mut self, alignment: &Alignment) -> Result<(), Error>;
-    /// Correction of a camera, relative to the pushed keyframes, that was optimized with the scene. `None` if there is
+/// Number of keyframes at which a live run is aligned for the first time: about four of them are validation images. It
+/// is aligned again each time the number has grown by the next constant, a factor.
+const FIRST_LIVE_ALIGNMENT: usize = 25;
+const LIVE_ALIGNMENT_GROWTH: f64 = std::f64::consts::SQRT_2;
+
+/// A keyframe with its corrections before and after an alignment.
+#[derive(Clone, Debug)]
+pub struct CorrectedKeyframe {
+    /// As it was pushed.
+    pub before: Arc<Keyframe>,
+    /// With the new corrections.
+    pub after: Arc<Keyframe>,
+}
+
+/// A model whose cameras can be corrected during training.
+pub trait Recalibrate: Method {
+    /// Replaces all keyframes pushed so far. The model moves along with its keyframes, or forgets all training if it
+    /// cannot be moved.
+    ///
+    /// * `keyframes`: in the order of their arrival, without test keyframes.
+    /// * `alignment`: the source of the new corrections.
+    fn recalibrate(&mut self, keyframes: &[CorrectedKeyframe], alignment: &Alignment) -> Result<(), Error>;
+    /// Correction of a camera that was optimized with the scene, relative to the pushed keyframes; `None` if there is
     /// none.
     fn learned_correction(&mut self, _camera: &str) -> Result<Option<CameraCorrection>, Error> {
         Ok(None)
@@ -53,11 +70,10 @@ pub struct Aligned<M> {
     alignment_steps: u64,
     /// Step at which the result of the running alignment is due.
     due_step: Option<u64>,
-    /// Keyframe counts at which alignment begins. Empty from the start if it begins at the first step instead.
-    at_keyframes: VecDeque<usize>,
-    /// Whether alignment is repeated with more keyframes.
-    is_live: bool,
-    /// Number of steps before the last restart.
+    timing: AlignTiming,
+    /// Number of keyframes at which the next alignment begins.
+    begins_at: usize,
+    /// Steps of the model before its last restart.
     n_steps_before_restart: u64,
 }
 
@@ -70,8 +86,8 @@ struct AlignedState {
     alignment: Option<Alignment>,
     alignment_steps: u64,
     due_step: Option<u64>,
-    at_keyframes: VecDeque<usize>,
-    is_live: bool,
+    timing: AlignTiming,
+    begins_at: usize,
     n_steps_before_restart: u64,
     /// Camera and stamp of the keyframes, until alignment is done.
     keyframes: Vec<(String, i64)>,
@@ -82,9 +98,8 @@ fn id_of(keyframe: &Keyframe) -> (&str, i64) {
     (&keyframe.camera, keyframe.stamp.0)
 }
 
-impl<M: Restartable + 'static> Aligned<M> {
-    /// Wraps a model and aligns its keyframes as specified by `choice`. The result is applied early in
-    /// `n_planned_steps`.
+impl<M: Recalibrate + 'static> Aligned<M> {
+    /// A model whose keyframes are aligned as specified by `choice`; the result is applied early in `n_planned_steps`.
     pub fn new(model: M, choice: CameraRefinement, is_software: bool, n_planned_steps: u64) -> Self {
         Self {
             model,
@@ -94,8 +109,8 @@ impl<M: Restartable + 'static> Aligned<M> {
             n_begun: None,
             alignment_steps: alignment_step(is_software, n_planned_steps),
             due_step: None,
-            at_keyframes: VecDeque::new(),
-            is_live: false,
+            timing: AlignTiming::Once,
+            begins_at: 0,
             n_steps_before_restart: 0,
         }
     }
@@ -105,10 +120,10 @@ impl<M: Restartable + 'static> Aligned<M> {
         if common.align == CameraRefinement::default() {
             return Box::new(model);
         }
-        let at_keyframes = VecDeque::from(common.align_at_keyframes.clone());
+        let begins_at = if common.align_timing == AlignTiming::Once { 0 } else { FIRST_LIVE_ALIGNMENT };
         Box::new(Self {
-            is_live: !at_keyframes.is_empty(),
-            at_keyframes,
+            timing: common.align_timing,
+            begins_at,
             ..Self::new(model, common.align.clone(), gpu.is_software(), common.n_planned_steps)
         })
     }
@@ -138,8 +153,8 @@ impl<M: Restartable + 'static> Aligned<M> {
             alignment,
             alignment_steps,
             due_step,
-            at_keyframes,
-            is_live,
+            timing,
+            begins_at,
             n_steps_before_restart,
             keyframes: ids,
             n_begun,
@@ -163,8 +178,8 @@ impl<M: Restartable + 'static> Aligned<M> {
             n_begun,
             alignment_steps,
             due_step,
-            at_keyframes,
-            is_live,
+            timing,
+            begins_at,
             n_steps_before_restart,
         };
         Ok((Box::new(aligned), untrained))
@@ -173,47 +188,65 @@ impl<M: Restartable + 'static> Aligned<M> {
     /// Starts alignment if it is requested and there are enough keyframes.
     fn begin_alignment(&mut self) {
         let n_keyframes = self.original_keyframes.len();
-        let has_begun = self.n_begun.is_some();
-        let waits = self.is_live && !has_begun && self.at_keyframes.front().is_none_or(|n| n_keyframes < *n);
-        if !self.alignment_task.is_requested() || waits {
+        let has_enough = self.n_begun.is_some() || n_keyframes >= self.begins_at;
+        if !self.alignment_task.is_requested() || !has_enough {
             return;
         }
         let n_begun = *self.n_begun.get_or_insert(n_keyframes);
-        let from = if self.is_live { self.model.progress().step } else { 0 };
-        self.due_step.get_or_insert(from + self.alignment_steps);
+        let from = if self.timing == AlignTiming::Once { 0 } else { self.model.progress().step };
+        if self.timing != AlignTiming::RealTime {
+            self.due_step.get_or_insert(from + self.alignment_steps);
+        }
         self.alignment_task.begin(self.original_keyframes[..n_begun].to_vec(), &self.choice);
     }
 
-    /// Applies the result of alignment when it is due, and restarts the model if corrections changed.
+    /// Applies the result of alignment at a fixed step, or when the model is idle.
     fn finish_alignment_when_due(&mut self) -> Result<(), Error> {
         let step = self.model.progress().step;
-        let is_idle = self.model.is_idle() && step > 0;
-        let is_due = self.due_step.is_some_and(|due_step| step >= due_step) || (is_idle && !self.is_waiting());
+        let is_idle = step > 0 && self.model.is_idle() && self.is_awaited();
+        let is_due = is_idle || self.due_step.is_some_and(|due_step| step >= due_step);
         if self.alignment_task.is_done() || !is_due {
             return Ok(());
         }
-        self.begin_alignment(); // Not started yet if the model was resumed at this step.
+        self.begin_alignment(); // A model that was resumed at this step has not started it.
+        self.finish_alignment()
+    }
+
+    /// Waits for the result of alignment and applies it.
+    fn finish_alignment(&mut self) -> Result<(), Error> {
+        let before: Vec<_> =
+            self.original_keyframes.iter().map(|keyframe| self.alignment_task.corrected(keyframe)).collect();
         let is_changed = self.alignment_task.finish(&self.original_keyframes)?;
         (self.n_begun, self.due_step) = (None, None);
-        let n_keyframes = self.original_keyframes.len();
-        self.at_keyframes.retain(|n| *n > n_keyframes);
-        let original_keyframes = match self.at_keyframes.is_empty() {
-            true => std::mem::take(&mut self.original_keyframes),
-            false => {
+        let originals = match self.timing {
+            AlignTiming::Once => std::mem::take(&mut self.original_keyframes),
+            AlignTiming::Lockstep | AlignTiming::RealTime => {
+                self.begins_at = next_live_alignment(self.original_keyframes.len());
                 self.alignment_task.request_again();
                 self.original_keyframes.clone()
             }
         };
         let Some(alignment) = self.alignment_task.result().filter(|_| is_changed) else { return Ok(()) };
-        log::info!("training restarts with corrected cameras");
-        self.n_steps_before_restart += self.model.n_total_steps()?;
-        self.model.restart(alignment)?;
-        original_keyframes.iter().try_for_each(|keyframe| self.model.push(self.alignment_task.corrected(keyframe)))
+        let after = originals.iter().map(|keyframe| self.alignment_task.corrected(keyframe));
+        let keyframes: Vec<_> =
+            before.into_iter().zip(after).map(|(before, after)| CorrectedKeyframe { before, after }).collect();
+        let n_steps = self.model.n_total_steps()?;
+        self.model.recalibrate(&keyframes, alignment)?;
+        let n_forgotten = n_steps.wrapping_sub(self.model.n_total_steps()?);
+        if n_forgotten > 0 {
+            log::info!("training restarted with corrected cameras");
+        }
+        self.n_steps_before_restart += n_forgotten;
+        Ok(())
     }
 
-    /// Whether the next alignment waits for more keyframes.
-    fn is_waiting(&self) -> bool {
-        self.is_live && self.n_begun.is_none()
+    /// Whether the model must wait for an alignment before its result is final.
+    fn is_awaited(&self) -> bool {
+        match self.timing {
+            AlignTiming::Once => !self.alignment_task.is_done(),
+            AlignTiming::Lockstep => self.n_begun.is_some(),
+            AlignTiming::RealTime => false,
+        }
     }
 
     /// Steps until the result of alignment is due.
@@ -226,7 +259,7 @@ impl<M: Restartable + 'static> Aligned<M> {
     }
 }
 
-impl<M: Restartable + 'static> Method for Aligned<M> {
+impl<M: Recalibrate + 'static> Method for Aligned<M> {
     fn push(&mut self, keyframe: Arc<Keyframe>) -> Result<(), Error> {
         self.model.push(self.alignment_task.corrected(&keyframe))?;
         let is_used = !self.alignment_task.is_done() && keyframe.split != Split::Test && keyframe.is_finite();
@@ -255,8 +288,17 @@ impl<M: Restartable + 'static> Method for Aligned<M> {
     }
 
     fn is_idle(&self) -> bool {
-        let has_ended = self.alignment_task.is_done() || self.is_waiting();
-        self.model.is_idle() && (has_ended || self.model.progress().step == 0)
+        self.model.is_idle() && (!self.is_awaited() || self.model.progress().step == 0)
+    }
+
+    fn poll_alignment(&mut self, wait: bool) -> Result<bool, Error> {
+        let has_begun = self.timing == AlignTiming::RealTime && self.n_begun.is_some();
+        let is_ready = has_begun && (wait || self.alignment_task.has_result());
+        if is_ready {
+            self.begin_alignment(); // A resumed model has not started it.
+            self.finish_alignment()?;
+        }
+        Ok(is_ready)
     }
 
     fn n_total_steps(&mut self) -> Result<u64, Error> {
@@ -333,8 +375,8 @@ impl<M: Restartable + 'static> Method for Aligned<M> {
             alignment: self.alignment_task.result().cloned(),
             alignment_steps: self.alignment_steps,
             due_step: self.due_step,
-            at_keyframes: self.at_keyframes.clone(),
-            is_live: self.is_live,
+            timing: self.timing,
+            begins_at: self.begins_at,
             n_steps_before_restart: self.n_steps_before_restart,
             keyframes: self
                 .original_keyframes
@@ -354,6 +396,12 @@ impl<M: Restartable + 'static> Method for Aligned<M> {
             Ok(checkpoint)
         }))
     }
+}
+
+/// Number of keyframes at which the next alignment of a live run begins after one with `n`.
+#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a number of keyframes")]
+fn next_live_alignment(n: usize) -> usize {
+    (n as f64 * LIVE_ALIGNMENT_GROWTH).ceil() as usize
 }
 
 #[cfg(test)]
@@ -406,7 +454,7 @@ mod tests {
         );
     }
 
-    fn check_restart<M: Restartable + 'static>(
+    fn check_restart<M: Recalibrate + 'static>(
         gpu: &Arc<Gpu>,
         model: M,
         resume: Resume<M>,
@@ -477,43 +525,44 @@ mod tests {
     }
 
     #[test]
-    fn live_model_restarts_when_more_keyframes_change_the_corrections() {
-        let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    fn more_keyframes_change_the_corrections() {
         let miscalibration = Miscalibration { extrinsics: wrong_extrinsics(), ..Miscalibration::none() };
-        let keyframes = capture(&miscalibration);
-        let is_used = |keyframe: &&Arc<Keyframe>| keyframe.split != Split::Test;
-        let n_used = keyframes.iter().filter(is_used).count();
-        let n_first = 2 * n_used / 3;
-        let common = CommonOptions {
-            align: CameraRefinement::Always(ParamSet::EXTRINSICS),
-            align_at_keyframes: vec![n_first, n_used],
-            n_planned_steps: 4 * ALIGNMENT_STEP,
-            ..CommonOptions::default()
-        };
-        let start = || Aligned::if_requested(MeanColor::new(ModelOptions::default()), &common, &gpu);
-        let mut model = start();
-        let (first, rest): (Vec<_>, Vec<_>) =
-            keyframes.iter().filter(is_used).enumerate().partition(|(ix, _)| *ix + 1 < n_first);
-        first.iter().for_each(|(_, keyframe)| model.push((*keyframe).clone()).unwrap());
-        train(&mut *model, ALIGNMENT_STEP + 3);
-        assert!(model.alignment().is_none(), "there are too few keyframes");
-        model.push(rest[0].1.clone()).unwrap();
-        train(&mut *model, ALIGNMENT_STEP + 2);
-        assert!(model.progress().step < ALIGNMENT_STEP, "the model must have restarted");
-        let correction = |model: &dyn Method| model.alignment().unwrap().corrections["wrist"].clone();
-        let remaining_after = |model: &dyn Method| remaining(&correction(model), &miscalibration.extrinsics);
-        let (degrees, mm) = remaining_after(&*model);
-        assert!(degrees < 0.1 && mm < 1.0, "{degrees} degrees, {mm} mm");
-        let step = model.progress().step;
-        rest[1..].iter().for_each(|(_, keyframe)| model.push((*keyframe).clone()).unwrap());
-        let before = correction(&*model);
-        train(&mut *model, ALIGNMENT_STEP + 2);
-        let has_restarted = model.progress().step < step + ALIGNMENT_STEP + 2;
-        assert_eq!(has_restarted, correction(&*model) != before, "must restart only if corrections change");
-        let (degrees, mm) = remaining_after(&*model);
-        assert!(degrees < 0.05 && mm < 0.5, "{degrees} degrees, {mm} mm");
-        train(&mut *model, 3 * ALIGNMENT_STEP);
-        assert!(model.progress().step > 2 * ALIGNMENT_STEP, "no further alignment");
+        let mut keyframes = capture(&miscalibration);
+        keyframes.retain(|keyframe| keyframe.split != Split::Test);
+        let n_first = 2 * keyframes.len() / 3;
+        for timing in [AlignTiming::Lockstep, AlignTiming::RealTime] {
+            let choice = CameraRefinement::Always(ParamSet::EXTRINSICS);
+            let mut model = Aligned {
+                timing,
+                begins_at: n_first,
+                ..Aligned::new(MeanColor::new(ModelOptions::default()), choice, true, 4 * ALIGNMENT_STEP)
+            };
+            let correction = |model: &dyn Method| model.alignment().unwrap().corrections["wrist"].clone();
+            let remaining_after = |model: &dyn Method| remaining(&correction(model), &miscalibration.extrinsics);
+            let is_real_time = timing == AlignTiming::RealTime;
+            keyframes[..n_first - 1].iter().for_each(|keyframe| model.push(keyframe.clone()).unwrap());
+            train(&mut model, ALIGNMENT_STEP + 3);
+            assert!(model.alignment().is_none() && !model.poll_alignment(true).unwrap(), "there are too few keyframes");
+            model.push(keyframes[n_first - 1].clone()).unwrap();
+            train(&mut model, ALIGNMENT_STEP + 2);
+            assert_eq!(model.alignment().is_none(), is_real_time, "in real time, results are applied on request");
+            assert_eq!(model.poll_alignment(true).unwrap(), is_real_time);
+            assert!(model.progress().step < ALIGNMENT_STEP, "the model must have restarted");
+            let (degrees, mm) = remaining_after(&model);
+            assert!(degrees < 0.1 && mm < 1.0, "{degrees} degrees, {mm} mm");
+            let step = model.progress().step;
+            keyframes[n_first..].iter().for_each(|keyframe| model.push(keyframe.clone()).unwrap());
+            let before = correction(&model);
+            train(&mut model, ALIGNMENT_STEP + 2);
+            assert_eq!(model.poll_alignment(true).unwrap(), is_real_time);
+            let has_restarted = model.progress().step < step + ALIGNMENT_STEP + 2;
+            assert_eq!(has_restarted, correction(&model) != before, "it restarts only for other corrections");
+            let (degrees, mm) = remaining_after(&model);
+            assert!(degrees < 0.05 && mm < 0.5, "{degrees} degrees, {mm} mm");
+            train(&mut model, 3 * ALIGNMENT_STEP);
+            assert!(model.progress().step > 2 * ALIGNMENT_STEP, "no further alignment");
+            assert!(!model.poll_alignment(true).unwrap());
+        }
     }
 
     #[test]
@@ -524,7 +573,7 @@ mod tests {
         check_training_continues(MeanColor::new(ModelOptions::default()));
     }
 
-    fn check_training_continues<M: Restartable + 'static>(model: M) {
+    fn check_training_continues<M: Recalibrate + 'static>(model: M) {
         let mut model = Aligned::new(model, CameraRefinement::Always(ParamSet::EXTRINSICS), true, 4 * ALIGNMENT_STEP);
         assert!(model.is_idle());
         for keyframe in scenes::ring(&[scenes::floor()], nalgebra::Point3::origin(), 2) {

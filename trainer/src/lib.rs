@@ -47,12 +47,12 @@ pub mod atomic_file;
 pub mod tsdf;
 mod view;
 
-pub use aligned::{Aligned, Restartable, ResumedModel};
+pub use aligned::{Aligned, CorrectedKeyframe, Recalibrate, ResumedModel};
 pub use bounds::Bounds;
 pub use error::Error;
 pub use failed_model::FailedModel;
 pub use method::{Method, Progress};
-pub use model_options::{CommonOptions, MethodOptions, ModelOptions};
+pub use model_options::{AlignTiming, CommonOptions, MethodOptions, ModelOptions};
 pub use model_spec::{LoadedModel, ModelSpec, Resumed, load, resume};
 pub use registry::ModelKind;
 pub use request::{Aabb, Picture, Projection, RenderRequest};

@@ -84,6 +84,11 @@ pub trait Method {
     fn profile_step(&mut self) -> Result<Vec<PassTiming>, Error>;
     /// Result of keyframe alignment; `None` until it is done, or if it was not requested or not possible.
     fn alignment(&self) -> Option<&Alignment>;
+    /// In a live run, applies the result of an alignment in the background if it is ready, or waits for it if `wait`.
+    /// Returns whether a result was applied, which depends on timing unless `wait` is set.
+    fn poll_alignment(&mut self, _wait: bool) -> Result<bool, Error> {
+        Ok(false)
+    }
     /// Progress of training.
     fn progress(&self) -> Progress;
     /// Reports of the trials, in the order in which they ran.

@@ -12,7 +12,20 @@ pub trait MethodOptions: Serialize + DeserializeOwned + Default {
     const METHOD: &'static str;
 }
 
-/// Options that all methods share. A method ignores options that do not apply to it.
+/// When the cameras of keyframes with depth are aligned.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum AlignTiming {
+    /// Once, with the keyframes that are known at the first step. The result is applied a fixed number of steps later.
+    Once,
+    /// Repeatedly as keyframes arrive. Results are applied a fixed number of steps later.
+    Lockstep,
+    /// Repeatedly as keyframes arrive. Results are applied by
+    /// [`Method::poll_alignment`](crate::Method::poll_alignment), so that training never waits for them.
+    RealTime,
+}
+
+/// Options that all methods share. A method ignores those that do not apply to it.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CommonOptions {
@@ -26,9 +39,8 @@ pub struct CommonOptions {
     pub cameras: CameraRefinement,
     /// Camera parameters that alignment estimates by registering keyframes that have depth.
     pub align: CameraRefinement,
-    /// For live runs: keyframe counts at which alignment runs. If empty, alignment runs once, with the keyframes
-    /// available at the first step.
-    pub align_at_keyframes: Vec<usize>,
+    /// When they are estimated.
+    pub align_timing: AlignTiming,
 }
 
 /// Options of a model. `S` is the type of the method-specific options; the default, JSON, holds those of any method.
@@ -49,7 +61,7 @@ impl Default for CommonOptions {
             n_planned_steps: 7000,
             cameras: CameraRefinement::default(),
             align: CameraRefinement::default(),
-            align_at_keyframes: Vec::new(),
+            align_timing: AlignTiming::Once,
         }
     }
 }

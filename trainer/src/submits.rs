@@ -68,11 +68,6 @@ impl Submits {
         self.step_millis
     }
 
-    /// Resets the smoothed step time.
-    pub(crate) fn reset_time(&mut self) {
-        self.step_millis = 0.0;
-    }
-
     #[cfg(test)]
     pub(crate) fn assume_step_millis(&mut self, millis: f64) {
         self.step_millis = millis;

@@ -56,6 +56,14 @@ impl Persistence {
         Ok(())
     }
 
+    /// Logs that the result of an alignment was applied.
+    pub(super) fn log_alignment(&mut self, method: &mut dyn Method) -> crate::Result<()> {
+        if let Some(decisions) = &mut self.decisions {
+            decisions.aligned(method.n_total_steps()?);
+        }
+        Ok(())
+    }
+
     /// Logs that a picture is drawn. Drawing affects the result, because it creates splats for new keyframes.
     pub(super) fn log_render(&mut self) {
         if let Some(decisions) = &mut self.decisions {

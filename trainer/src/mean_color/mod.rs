@@ -8,7 +8,7 @@ use crate::keyframe_signature::{self, KeyframeSignature};
 use crate::method_entry::MethodEntry;
 use crate::model_metadata::METADATA_FILE;
 use crate::model_options::{MethodOptions, ModelOptions, default_options};
-use crate::{Aligned, Error, Method, Picture, Progress, RenderRequest, Restartable};
+use crate::{Aligned, CorrectedKeyframe, Error, Method, Picture, Progress, Recalibrate, RenderRequest};
 use calibration::Alignment;
 use calibration::{CalibratedCamera, ParamSet, TrialReport};
 use keyframe::{Keyframe, Split};
@@ -122,10 +122,10 @@ fn mean_srgb(keyframe: &Keyframe) -> [f64; 3] {
     [0, 1, 2].map(|channel| sum(channel) / pixels.len().max(1) as f64)
 }
 
-impl Restartable for MeanColor {
-    fn restart(&mut self, _alignment: &Alignment) -> Result<(), Error> {
+impl Recalibrate for MeanColor {
+    fn recalibrate(&mut self, keyframes: &[CorrectedKeyframe], _: &Alignment) -> Result<(), Error> {
         *self = Self::new(self.options.clone());
-        Ok(())
+        keyframes.iter().try_for_each(|keyframe| self.push(keyframe.after.clone()))
     }
 }
 

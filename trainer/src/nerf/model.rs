@@ -14,7 +14,7 @@ use crate::gpu::{Gpu, PassTiming};
 use crate::model_options::ModelOptions;
 use crate::submits::Submits;
 use crate::view::{Camera, projections};
-use crate::{Bounds, Error, Method, Picture, Progress, RenderRequest, Restartable};
+use crate::{Bounds, CorrectedKeyframe, Error, Method, Picture, Progress, Recalibrate, RenderRequest};
 use calibration::Alignment;
 use calibration::TrialReport;
 use calibration::{CalibratedCamera, CameraCorrection, EMBEDDING_DIM, ParamSet};
@@ -248,14 +248,15 @@ impl NerfModel {
     }
 }
 
-impl Restartable for NerfModel {
-    fn restart(&mut self, _alignment: &Alignment) -> Result<(), Error> {
+impl Recalibrate for NerfModel {
+    /// Restarts: the field cannot be moved.
+    fn recalibrate(&mut self, keyframes: &[CorrectedKeyframe], _: &Alignment) -> Result<(), Error> {
         self.finish_in_flight()?;
         let compiled = self.compiled.take();
         let is_watched = self.submits.is_watched();
         *self = Self { compiled, ..Self::new(self.gpu.clone(), self.options.clone())? };
         self.set_watched(is_watched);
-        Ok(())
+        keyframes.iter().try_for_each(|keyframe| self.push(keyframe.after.clone()))
     }
 
     fn learned_correction(&mut self, camera: &str) -> Result<Option<CameraCorrection>, Error> {

@@ -41,24 +41,23 @@ fn wrong_extrinsics_are_corrected_and_resuming_is_exact() {
     let miscalibration = Miscalibration { extrinsics: wrong_extrinsics(), ..Miscalibration::none() };
     let keyframes = capture(&miscalibration);
     let mut uninterrupted = new_model(&gpu, &keyframes);
-    // When the alignment is applied, training restarts at step 0.
     train_to(&mut uninterrupted, ALIGNMENT_STEP);
     assert!(uninterrupted.alignment().is_none());
     uninterrupted.step(1).unwrap();
-    assert_eq!(uninterrupted.progress().step, 1, "training restarted");
+    assert_eq!(uninterrupted.progress().step, ALIGNMENT_STEP + 1, "training continues");
     let correction = uninterrupted.alignment().unwrap().corrections["wrist"].clone();
     let (degrees, mm) = remaining(&correction, &miscalibration.extrinsics);
     assert!(degrees < 0.05 && mm < 0.5, "{degrees} degrees, {mm} mm");
     let test = keyframes.iter().find(|keyframe| keyframe.split == Split::Test).unwrap();
     assert_eq!(uninterrupted.calibrated_camera(test).unwrap(), correction.apply(test));
-    train_to(&mut uninterrupted, 10);
+    train_to(&mut uninterrupted, ALIGNMENT_STEP + 10);
 
     // Interrupt training before and after the alignment is applied. Stored keyframes are not in the order of arrival.
     let mut stored = keyframes.clone();
     stored.reverse();
     let mut interrupted: Box<dyn Method> = Box::new(new_model(&gpu, &keyframes));
     train_to(&mut *interrupted, 10);
-    for end in [1, 7, 10] {
+    for end in [ALIGNMENT_STEP + 1, ALIGNMENT_STEP + 7, ALIGNMENT_STEP + 10] {
         let checkpoint = interrupted.checkpoint().unwrap().finish().unwrap();
         let untrained;
         (interrupted, untrained) =

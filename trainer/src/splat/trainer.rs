@@ -8,6 +8,7 @@ mod model_search;
 mod model_size;
 mod optimizer;
 mod products;
+mod recalibration;
 mod recorder;
 mod renderer;
 mod saved_arrays;
@@ -33,8 +34,8 @@ use crate::gpu::{Gpu, PassTiming};
 use crate::model_metadata::{METADATA_FILE, read_metadata};
 use crate::model_options::{MethodOptions, ModelOptions};
 use crate::view::projections;
-use crate::{Bounds, Error, Method, Picture, Progress, Projection, RenderRequest, Restartable};
-use calibration::{Alignment, CalibratedCamera, CameraCorrection, ParamSet, Trial, TrialReport};
+use crate::{Bounds, Error, Method, Picture, Progress, Projection, RenderRequest};
+use calibration::{Alignment, CalibratedCamera, CameraCorrection, Trial, TrialReport};
 use keyframe::{Keyframe, Split};
 use kinematics::Stamp;
 use lazy_pipelines::LazyPipelines;
@@ -197,30 +198,6 @@ impl SplatTrainer {
     fn draw_view(&mut self, camera: &Camera, background_srgb: [f32; 3], depth: bool) -> Result<Picture, Error> {
         let drawn = DrawnView { splats: self.trials.displayed(&self.model.splats), camera, background_srgb };
         self.renderer.picture(&mut self.recorder, drawn, depth)
-    }
-}
-
-impl Restartable for SplatTrainer {
-    fn restart(&mut self, alignment: &Alignment) -> Result<(), Error> {
-        self.finish_in_flight()?;
-        let Self { options, recorder, .. } = self;
-        recorder.passes.clear_bindings();
-        let (gpu, is_software) = (&recorder.gpu, recorder.gpu.is_software());
-        self.model = TrainedModel::new(gpu, options)?;
-        self.optimizer.restart(gpu);
-        self.schedule = Schedule::new(options.common.n_planned_steps);
-        self.views = ViewSet::new(options, is_software);
-        self.seeding = Seeding::new(options, is_software);
-        self.trials = SplatTrials::new(&options.common.cameras, options.specific.count);
-        let poses = ParamSet::IMAGE_POSES;
-        if alignment.has_image_poses() && self.trials.remove_candidate(poses) {
-            self.model.cameras.enable(poses); // Aligned poses are accurate to millimeters; training refines them.
-        }
-        Ok(())
-    }
-
-    fn learned_correction(&mut self, camera: &str) -> Result<Option<CameraCorrection>, Error> {
-        Ok(self.camera_corrections()?.remove(camera))
     }
 }
 

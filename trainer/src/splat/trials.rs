@@ -398,7 +398,16 @@ impl SplatTrials {
         Some(TrialEnd { restored: Some(*other), seeded, deferred })
     }
 
-    /// Takes the running trial if it is in its second half.
+    /// Ends the trial in progress, in either half; it is repeated.
+    pub(crate) fn abort(&mut self) -> Option<TrialEnd> {
+        let canceled = self.cancel();
+        if self.running_trial().is_some() {
+            self.trial_phase = SplatTrialPhase::Waiting; // The first half trains the baseline.
+        }
+        canceled
+    }
+
+    /// Ends a trial in its second half.
     fn take_second_half(&mut self) -> Option<RunningTrial> {
         match std::mem::replace(&mut self.trial_phase, SplatTrialPhase::Waiting) {
             SplatTrialPhase::Running(trial) if trial.is_second_half() => Some(trial),

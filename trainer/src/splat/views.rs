@@ -10,13 +10,16 @@ use crate::Error;
 use crate::gpu::{Buffer, Gpu};
 use crate::view::{depth_in_color_view, median_depth_m};
 use calibration::CalibratedCamera;
-use keyframe::Keyframe;
+use keyframe::{DepthMap, Keyframe};
 use std::collections::BTreeSet;
 use std::sync::Arc;
 
 /// Near and far clipping distances of training cameras along z, meters.
 const NEAR_M: f64 = 0.01;
 pub(crate) const FAR_M: f64 = 1e4;
+
+/// Transforms that differ by less, in meters and radians, are the same up to rounding.
+const MAX_ROUNDING: f64 = 1e-9;
 
 /// One training keyframe.
 #[derive(Debug)]
@@ -134,6 +137,24 @@ impl TrainView {
         Self { median_depth_m: median_depth_m(&keyframe), keyframe, levels: [const { None }; 3], lens: None }
     }
 
+    /// Replaces the camera by that of the same keyframe with other corrections. Uploaded images are kept unless the
+    /// correction changes them.
+    pub(crate) fn replace_camera(&mut self, gpu: &Gpu, keyframe: Arc<Keyframe>) {
+        let has_same_depth = has_same_depth(&self.keyframe, &keyframe);
+        self.lens = None;
+        self.keyframe = keyframe;
+        if !has_same_depth {
+            self.median_depth_m = median_depth_m(&self.keyframe);
+            self.levels = [const { None }; 3];
+        }
+        for (level_ix, level) in self.levels.iter().enumerate() {
+            if let Some(level) = level {
+                let view = camera_of(&self.keyframe).at_level(level_ix as u32).view();
+                gpu.write(&level.view, 0, bytemuck::bytes_of(&view));
+            }
+        }
+    }
+
     /// Allocates slots for the camera parameters of this view.
     pub(crate) fn assign_lens(&mut self, gpu: &Gpu, cameras: &mut CameraParams) -> Result<(), Error> {
         if self.lens.is_none() {
@@ -238,6 +259,25 @@ impl LevelImages {
     pub(crate) fn size_px(&self) -> [u32; 2] {
         self.camera.size_px
     }
+}
+
+/// Whether the depth of two versions of a keyframe, seen from its color camera, is the same.
+fn has_same_depth(a: &Keyframe, b: &Keyframe) -> bool {
+    let color_from_depth = |keyframe: &Keyframe| CalibratedCamera::of(keyframe).color_from_depth;
+    let is_same_frame = match (color_from_depth(a), color_from_depth(b)) {
+        (Some(a), Some(b)) => {
+            let rounding = a.inverse() * b;
+            rounding.translation.vector.norm() < MAX_ROUNDING && rounding.rotation.angle() < MAX_ROUNDING
+        }
+        (a, b) => a.is_none() && b.is_none(),
+    };
+    let is_same_lens = |a: &DepthMap, b: &DepthMap| a.focal_px == b.focal_px && a.principal_px == b.principal_px;
+    let has_same_readings = a
+        .depth
+        .as_ref()
+        .zip(b.depth.as_ref())
+        .is_none_or(|(a, b)| is_same_lens(a, b) && (Arc::ptr_eq(&a.depth_m, &b.depth_m) || a.depth_m == b.depth_m));
+    is_same_frame && has_same_readings && a.focal_px == b.focal_px && a.principal_px == b.principal_px
 }
 
 /// The uncorrected camera of a keyframe.

@@ -23,7 +23,7 @@ use crate::checkpoint::PendingCheckpoint;
 use crate::gpu::{Gpu, PassTiming, Passes};
 use crate::model_options::ModelOptions;
 use crate::view::projections;
-use crate::{Error, Method, Picture, Progress, RenderRequest, Restartable};
+use crate::{CorrectedKeyframe, Error, Method, Picture, Progress, Recalibrate, RenderRequest};
 use calibration::Alignment;
 use calibration::CalibratedCamera;
 use calibration::TrialReport;
@@ -245,13 +245,14 @@ impl TsdfModel {
     }
 }
 
-impl Restartable for TsdfModel {
-    fn restart(&mut self, _alignment: &Alignment) -> Result<(), Error> {
+impl Recalibrate for TsdfModel {
+    /// Fuses all keyframes again: the contribution of each one to the sums is unknown.
+    fn recalibrate(&mut self, keyframes: &[CorrectedKeyframe], _: &Alignment) -> Result<(), Error> {
         self.finish_in_flight()?;
         let is_watched = self.fusion.submits.is_watched();
         *self = Self::new(self.gpu.clone(), self.options.clone())?;
         self.set_watched(is_watched);
-        Ok(())
+        keyframes.iter().try_for_each(|keyframe| self.push(keyframe.after.clone()))
     }
 }
 

@@ -8,6 +8,7 @@ use super::{Camera, LOW_PASS_PX2};
 use crate::{Error, Picture, Projection, RenderRequest};
 use kinematics::Transform;
 use nalgebra::{Rotation3, UnitQuaternion, Vector3};
+use rayon::prelude::*;
 use std::f64::consts::{FRAC_PI_2, PI};
 
 /// Renders a request with `draw`, which renders one pinhole picture. Depth is rendered only if requested.
@@ -56,35 +57,41 @@ fn all_directions(
         about(Vector3::x_axis(), -FRAC_PI_2),
     ];
     let faces: Vec<Picture> = face_rotations.iter().map(|rotation| draw(&face(*rotation))).collect::<Result<_, _>>()?;
-    let n = (width * height) as usize;
+    let face_from_camera = face_rotations.map(|rotation| rotation.inverse());
+    // The picture of the face that a pixel shows, the index of the pixel in it, and the cosine of the angle to its axis.
+    let sample = |x: u32, y: u32| {
+        let latitude = FRAC_PI_2 - PI * (f64::from(y) + 0.5) / f64::from(height);
+        let longitude = 2.0 * PI * (f64::from(x) + 0.5) / f64::from(width) - PI;
+        let direction =
+            Vector3::new(latitude.cos() * longitude.sin(), -latitude.sin(), latitude.cos() * longitude.cos());
+        let (face, in_face) = faces
+            .iter()
+            .zip(face_from_camera.iter().map(|rotation| rotation * direction))
+            .max_by(|(_, a), (_, b)| a.z.total_cmp(&b.z))
+            .expect("a cube has six faces");
+        let pixel = |axis: usize| {
+            let coordinate = f64::from(edge) / 2.0 * (1.0 + in_face[axis] / in_face.z);
+            (coordinate.max(0.0) as u32).min(edge - 1)
+        };
+        (face, (pixel(1) * edge + pixel(0)) as usize, crate::gpu::f32_of(in_face.z))
+    };
+    let (row_px, n) = (width as usize, (width * height) as usize);
     let mut picture = Picture {
         size_px: request.size_px,
-        rgba_srgb: Vec::with_capacity(4 * n),
-        depth_m: Vec::with_capacity(if request.depth { n } else { 0 }),
+        rgba_srgb: vec![0; 4 * n],
+        depth_m: vec![0.0; if request.depth { n } else { 0 }],
     };
-    for y in 0..height {
-        let latitude = FRAC_PI_2 - PI * (f64::from(y) + 0.5) / f64::from(height);
-        for x in 0..width {
-            let longitude = 2.0 * PI * (f64::from(x) + 0.5) / f64::from(width) - PI;
-            let direction =
-                Vector3::new(latitude.cos() * longitude.sin(), -latitude.sin(), latitude.cos() * longitude.cos());
-            let (face_ix, in_face) = face_rotations
-                .iter()
-                .map(|rotation| rotation.inverse() * direction)
-                .enumerate()
-                .max_by(|(_, a), (_, b)| a.z.total_cmp(&b.z))
-                .expect("a cube has six faces");
-            let pixel = |axis: usize| {
-                let coordinate = f64::from(edge) / 2.0 * (1.0 + in_face[axis] / in_face.z);
-                (coordinate.max(0.0) as u32).min(edge - 1)
-            };
-            let at = (pixel(1) * edge + pixel(0)) as usize;
-            let face_picture = &faces[face_ix];
-            picture.rgba_srgb.extend_from_slice(&face_picture.rgba_srgb[4 * at..4 * at + 4]);
-            if request.depth {
-                picture.depth_m.push(face_picture.depth_m[at] / crate::gpu::f32_of(in_face.z));
-            }
+    picture.rgba_srgb.par_chunks_mut(4 * row_px).zip(0..height).for_each(|(row, y)| {
+        for (pixel, x) in row.chunks_exact_mut(4).zip(0..) {
+            let (face, at, _) = sample(x, y);
+            pixel.copy_from_slice(&face.rgba_srgb[4 * at..4 * at + 4]);
         }
-    }
+    });
+    picture.depth_m.par_chunks_mut(row_px).zip(0..height).for_each(|(row, y)| {
+        for (depth_m, x) in row.iter_mut().zip(0..) {
+            let (face, at, cosine) = sample(x, y);
+            *depth_m = face.depth_m[at] / cosine;
+        }
+    });
     Ok(picture)
 }

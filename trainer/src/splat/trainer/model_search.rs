@@ -96,7 +96,12 @@ impl SplatTrainer {
         self.end_trial(canceled)
     }
 
-    /// Stops all trials after an out-of-memory error, because trials need a copy of the model. Training continues.
+    /// Ends a trial without a decision; it is repeated.
+    pub(super) fn abort_trial(&mut self) -> Result<(), Error> {
+        self.trials.abort().map_or(Ok(()), |aborted| self.end_trial(aborted))
+    }
+
+    /// Ends all trials, which need copies of the model, if there is no memory for them. Training continues.
     fn end_trials_without_memory(&mut self, error: Error) -> Result<(), Error> {
         if !error.is_out_of_memory() {
             return Err(error);

@@ -76,12 +76,6 @@ impl Optimizer {
         })
     }
 
-    /// Restarts at step 0.
-    pub(super) fn restart(&mut self, gpu: &Gpu) {
-        self.submits.reset_time();
-        self.write_counter(gpu, status::STEP, 0);
-    }
-
     /// Uploads the learning rates of the next steps.
     pub(super) fn write_rule(&self, gpu: &Gpu, rule: &Rule) {
         gpu.write(&self.rule, 0, bytemuck::bytes_of(rule));

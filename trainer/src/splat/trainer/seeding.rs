@@ -4,7 +4,7 @@ use super::view_set::ViewSet;
 use crate::model_options::ModelOptions;
 use crate::splat::arrays::SplatArrays;
 use crate::splat::options::SplatOptions;
-use crate::splat::seed::Density;
+use crate::splat::seed::{Density, Seeder};
 use crate::splat::snapshot::ObservedScene;
 use keyframe::Keyframe;
 use kinematics::quantile::{Rank, quantile};
@@ -73,7 +73,19 @@ impl Seeding {
         Some(discs)
     }
 
-    /// Takes the keyframes with areas that depth does not cover.
+    /// Replaces the cameras of all keyframes; `correct` replaces a keyframe. The corrected `views` determine which
+    /// positions have splats.
+    pub(super) fn replace_cameras(&mut self, correct: impl Fn(&mut Arc<Keyframe>), views: &ViewSet) {
+        self.pending.iter_mut().chain(&mut self.unseeded).for_each(correct);
+        let is_pending = |keyframe: &Keyframe| {
+            self.pending.iter().any(|other| other.camera == keyframe.camera && other.stamp == keyframe.stamp)
+        };
+        let seeded: Vec<_> = views.keyframes().filter(|keyframe| !is_pending(keyframe)).cloned().collect();
+        self.scene.seeder = Seeder::default();
+        drop(self.scene.seeder.discs(&seeded, self.density)); // The model has them already.
+    }
+
+    /// Keyframes with areas that depth does not cover.
     pub(super) fn take_unseeded(&mut self) -> Vec<Arc<Keyframe>> {
         std::mem::take(&mut self.unseeded)
     }

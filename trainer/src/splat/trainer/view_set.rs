@@ -86,6 +86,15 @@ impl ViewSet {
         self.views = keyframes.into_iter().map(TrainView::new).collect();
     }
 
+    /// Replaces the cameras of all views; `correct` replaces a keyframe. Uploaded images are kept where possible.
+    pub(super) fn replace_cameras(&mut self, gpu: &Gpu, correct: impl Fn(&mut Arc<Keyframe>)) {
+        for view in &mut self.views {
+            let mut keyframe = view.keyframe.clone();
+            correct(&mut keyframe);
+            view.replace_camera(gpu, keyframe);
+        }
+    }
+
     /// See [`SplatOptions::coarse_steps`].
     pub(super) fn coarse_steps(&self) -> [u64; 2] {
         self.coarse_steps

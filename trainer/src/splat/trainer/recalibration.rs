@@ -1,0 +1,287 @@
+//! Corrects the cameras of a model in training: the splats move along with the keyframes that show them.
+//!
+//! A splat that was trained on wrong poses lies where its keyframes agree most. Each keyframe would carry it to where the
+//! same pixel lies after the correction; the splat moves to the mean of these positions, weighted by how well the depth of
+//! each keyframe agrees with it. Coefficients of spherical
+//! harmonics are not rotated, because corrections are a few degrees at most.
+
+use super::SplatTrainer;
+use crate::gpu::{Gpu, f32s_of};
+use crate::splat::buffers::SplatBuffers;
+use crate::splat::camera_params::CameraParams;
+use crate::{CorrectedKeyframe, Error, Recalibrate};
+use calibration::{Alignment, CameraCorrection, ParamSet};
+use keyframe::{DepthMap, Keyframe};
+use kinematics::Transform;
+use nalgebra::{Point3, Quaternion, UnitQuaternion, Vector3};
+use rayon::prelude::*;
+use std::collections::HashMap;
+use std::sync::Arc;
+
+/// Maximum number of keyframes that determine the motion of the splats, spread evenly over all.
+const MAX_KEYFRAMES: usize = 64;
+/// A splat belongs to the surface of a depth reading if it is at most this fraction of its depth away.
+const SURFACE_FRAC: f64 = 0.05;
+/// Depth error, as a fraction of the depth, at which the weight of a keyframe is halved.
+const AGREEMENT_FRAC: f64 = 0.001;
+/// Weight of a keyframe without a depth reading: it shows the splat unless something hides it.
+const WITHOUT_DEPTH: f64 = 1e-4;
+/// Parameters of single images, which stay enabled. Shared parameters are part of the alignment.
+const IMAGE_PARAMS: ParamSet = ParamSet::IMAGE_POSES.union(ParamSet::IMAGE_GAINS);
+
+impl Recalibrate for SplatTrainer {
+    fn recalibrate(&mut self, keyframes: &[CorrectedKeyframe], alignment: &Alignment) -> Result<(), Error> {
+        self.finish_in_flight()?;
+        self.abort_trial()?;
+        let learned = match self.model.cameras.set.is_empty() {
+            true => None,
+            false => Some(self.camera_corrections()?),
+        };
+        let gpu = self.recorder.gpu.clone();
+        let motions = motions(keyframes, |camera| learned.as_ref()?.get(camera));
+        move_splats(&gpu, &self.model.splats, &motions)?;
+        let after: HashMap<_, _> =
+            keyframes.iter().map(|keyframe| (id_of(&keyframe.before), &keyframe.after)).collect();
+        let corrected = |keyframe: &mut Arc<Keyframe>| {
+            if let Some(after) = after.get(&id_of(keyframe)) {
+                *keyframe = Arc::clone(after);
+            }
+        };
+        self.recorder.passes.clear_bindings();
+        self.views.replace_cameras(&gpu, corrected);
+        self.seeding.replace_cameras(corrected, &self.views);
+        self.trials.validation.iter_mut().for_each(|image| corrected(&mut image.keyframe));
+        let mut params = self.model.cameras.set & IMAGE_PARAMS;
+        if alignment.has_image_poses() && self.trials.remove_candidate(ParamSet::IMAGE_POSES) {
+            params |= ParamSet::IMAGE_POSES; // Depth gives image poses to a few millimeters; the splats refine them.
+        }
+        self.model.cameras = CameraParams::new(&gpu, self.options.common.cameras.always() | params)?;
+        self.schedule.extend_for_arrival();
+        Ok(())
+    }
+
+    fn learned_correction(&mut self, camera: &str) -> Result<Option<CameraCorrection>, Error> {
+        Ok(self.camera_corrections()?.remove(camera))
+    }
+}
+
+fn id_of(keyframe: &Keyframe) -> (Arc<str>, i64) {
+    (keyframe.camera.clone(), keyframe.stamp.0)
+}
+
+/// A pinhole camera.
+#[derive(Clone, Copy, Debug)]
+struct Pinhole {
+    camera_from_world: Transform,
+    world_from_camera: Transform,
+    size_px: [f64; 2],
+    focal_px: [f64; 2],
+    principal_px: [f64; 2],
+}
+
+impl Pinhole {
+    fn of(keyframe: &Keyframe) -> Self {
+        let Keyframe { world_from_camera, size_px, focal_px, principal_px, .. } = *keyframe;
+        let size_px = size_px.map(f64::from);
+        Self { camera_from_world: world_from_camera.inverse(), world_from_camera, size_px, focal_px, principal_px }
+    }
+
+    fn of_depth(depth: &DepthMap) -> Self {
+        let DepthMap { world_from_camera, size_px, focal_px, principal_px, .. } = *depth;
+        let size_px = size_px.map(f64::from);
+        Self { camera_from_world: world_from_camera.inverse(), world_from_camera, size_px, focal_px, principal_px }
+    }
+
+    /// Pixel and depth of a point in the world, if the image contains it.
+    fn project(&self, point: &Point3<f64>) -> Option<([f64; 2], f64)> {
+        let point = self.camera_from_world * point;
+        let px = [0, 1].map(|axis| self.focal_px[axis] * point[axis] / point.z + self.principal_px[axis]);
+        let is_inside = point.z > 0.0 && (0..2).all(|axis| px[axis] >= 0.0 && px[axis] < self.size_px[axis]);
+        is_inside.then_some((px, point.z))
+    }
+
+    /// The point in the world at a pixel and depth.
+    fn point(&self, px: [f64; 2], z: f64) -> Point3<f64> {
+        let ray = [0, 1].map(|axis| (px[axis] - self.principal_px[axis]) / self.focal_px[axis]);
+        self.world_from_camera * Point3::from(Vector3::new(ray[0], ray[1], 1.0) * z)
+    }
+}
+
+/// The reading at a pixel within the depth map, meters along z.
+#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "pixels within the image")]
+fn reading_m(depth: &DepthMap, px: [f64; 2]) -> f64 {
+    let [x, y] = px.map(|px| px as usize);
+    depth.depth_m[y * depth.size_px[0] as usize + x].into()
+}
+
+/// The motion of what one keyframe shows.
+struct Motion {
+    before: Pinhole,
+    after: Pinhole,
+    /// Camera and readings of the depth before the correction.
+    depth: Option<(Pinhole, DepthMap)>,
+    rotation: UnitQuaternion<f64>,
+}
+
+impl Motion {
+    /// Where the correction moves a point, and the weight of this motion; `None` if the keyframe does not show the point.
+    fn of_point(&self, point: &Point3<f64>) -> Option<(Point3<f64>, f64)> {
+        let (px, z) = self.before.project(point)?;
+        let known = self.depth.as_ref().and_then(|(camera, depth)| {
+            let (px, z) = camera.project(point)?;
+            let reading = reading_m(depth, px);
+            (reading > 0.0).then_some((reading - z) / z)
+        });
+        let weight = match known {
+            Some(error_frac) if error_frac.abs() > SURFACE_FRAC => return None,
+            Some(error_frac) => 1.0 / (1.0 + (error_frac / AGREEMENT_FRAC).powi(2)),
+            None => WITHOUT_DEPTH,
+        };
+        Some((self.after.point(px, z), weight))
+    }
+}
+
+/// The motions of a subset of the keyframes. `learned` returns the correction of a camera that was learned with the splats
+/// on top of those in the keyframes.
+fn motions<'a>(keyframes: &[CorrectedKeyframe], learned: impl Fn(&str) -> Option<&'a CameraCorrection>) -> Vec<Motion> {
+    let n = keyframes.len().min(MAX_KEYFRAMES);
+    let subset = (0..n).map(|ix| &keyframes[ix * keyframes.len() / n]);
+    let motion = |CorrectedKeyframe { before, after }: &CorrectedKeyframe| {
+        let before =
+            learned(&before.camera).map_or_else(|| before.clone(), |learned| Arc::new(learned.corrected(before)));
+        let rotation = after.world_from_camera.rotation * before.world_from_camera.rotation.inverse();
+        Motion {
+            before: Pinhole::of(&before),
+            after: Pinhole::of(after),
+            depth: before.depth.clone().map(|depth| (Pinhole::of_depth(&depth), depth)),
+            rotation,
+        }
+    };
+    subset.map(motion).collect()
+}
+
+/// Position and rotation of a splat after the correction: the weighted means over the keyframes that show it, or those of
+/// the nearest camera if none does.
+fn moved(motions: &[Motion], point: &Point3<f64>) -> Option<(Point3<f64>, UnitQuaternion<f64>)> {
+    let (mut weights, mut shift) = (0.0, Vector3::zeros());
+    let mut rotations = Quaternion::from_parts(0.0, Vector3::zeros());
+    for motion in motions {
+        let Some((position, weight)) = motion.of_point(point) else { continue };
+        let rotation = motion.rotation.into_inner();
+        rotations += if rotation.w < 0.0 { -rotation } else { rotation } * weight; // Both signs are the same rotation.
+        shift += (position - point) * weight;
+        weights += weight;
+    }
+    if weights > 0.0 {
+        return Some((point + shift / weights, UnitQuaternion::from_quaternion(rotations)));
+    }
+    let distance =
+        |motion: &&Motion| (motion.before.world_from_camera.translation.vector - point.coords).norm_squared();
+    let nearest = motions.iter().min_by(|a, b| distance(a).total_cmp(&distance(b)))?;
+    let in_camera = nearest.before.camera_from_world * point;
+    Some((nearest.after.world_from_camera * in_camera, nearest.rotation))
+}
+
+/// Moves the splats on the GPU.
+fn move_splats(gpu: &Gpu, splats: &SplatBuffers, motions: &[Motion]) -> Result<(), Error> {
+    let n = splats.n_splats as usize;
+    let mut means: Vec<[f32; 4]> = gpu.read(&splats.means, n)?;
+    let mut rotations_wxyz: Vec<[f32; 4]> = gpu.read(&splats.rotations, n)?;
+    means.par_iter_mut().zip(&mut rotations_wxyz).for_each(|(mean, rotation_wxyz)| {
+        let [x, y, z, w] = mean.map(f64::from);
+        let Some((position, rotation)) = moved(motions, &Point3::new(x, y, z)) else { return };
+        let [qw, qx, qy, qz] = rotation_wxyz.map(f64::from);
+        let turned = rotation.into_inner() * Quaternion::new(qw, qx, qy, qz);
+        *mean = f32s_of([position.x, position.y, position.z, w]);
+        *rotation_wxyz = f32s_of([turned.w, turned.i, turned.j, turned.k]);
+    });
+    gpu.write(&splats.means, 0, bytemuck::cast_slice(&means));
+    gpu.write(&splats.rotations, 0, bytemuck::cast_slice(&rotations_wxyz));
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::Method;
+    use crate::gpu::GpuOptions;
+    use crate::model_options::ModelOptions;
+    use crate::splat::SplatOptions;
+    use calibration::scenes::{Miscalibration, capture, wrong_extrinsics};
+    use kinematics::quantile::{Rank, quantile};
+
+    /// Median distance of the splats from the depth readings of these keyframes, meters along z.
+    fn surface_error_m(trainer: &mut SplatTrainer, keyframes: &[Arc<Keyframe>]) -> f64 {
+        let depths: Vec<_> = keyframes
+            .iter()
+            .filter_map(|keyframe| keyframe.depth.clone())
+            .map(|depth| (Pinhole::of_depth(&depth), depth))
+            .collect();
+        let mut errors = Vec::new();
+        for mean in trainer.arrays().unwrap().means {
+            let point = Point3::from(mean.map(f64::from));
+            for (camera, depth) in &depths {
+                let Some((px, z)) = camera.project(&point) else { continue };
+                let error = (reading_m(depth, px) - z).abs();
+                errors.extend((error < 0.1).then_some(error));
+            }
+        }
+        quantile(&mut errors, 0.5, Rank::Upper).unwrap()
+    }
+
+    #[test]
+    fn splats_move_to_the_surfaces_of_the_corrected_keyframes() {
+        let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+        let miscalibration = Miscalibration { extrinsics: wrong_extrinsics(), ..Miscalibration::none() };
+        let [wrong, right] = [miscalibration, Miscalibration::none()].map(|miscalibration| {
+            let mut keyframes = capture(&miscalibration);
+            keyframes.retain(|keyframe| keyframe.split == keyframe::Split::Train);
+            keyframes
+        });
+        let specific = SplatOptions { max_splats: 4000, sh_degree: 0, ..SplatOptions::default() };
+        let start = |keyframes: &[Arc<Keyframe>]| {
+            let options = ModelOptions { specific: specific.clone(), ..ModelOptions::default() };
+            let mut trainer = SplatTrainer::new(gpu.clone(), options).unwrap();
+            keyframes.iter().for_each(|keyframe| trainer.push(keyframe.clone()).unwrap());
+            trainer.seed().unwrap();
+            trainer
+        };
+        let right_error_m = surface_error_m(&mut start(&right), &right);
+        let mut trainer = start(&wrong);
+        let wrong_error_m = surface_error_m(&mut trainer, &right);
+        let (n_splats, n_seeds) = (trainer.progress().primitives, trainer.n_seeds());
+        let pairs = wrong.iter().zip(&right);
+        let corrected: Vec<_> =
+            pairs.map(|(before, after)| CorrectedKeyframe { before: before.clone(), after: after.clone() }).collect();
+        trainer.recalibrate(&corrected, &Alignment::default()).unwrap();
+        let moved_error_m = surface_error_m(&mut trainer, &right);
+        assert!(wrong_error_m > 3.0 * right_error_m, "{wrong_error_m} m must exceed {right_error_m} m");
+        assert!(moved_error_m < 1.5 * right_error_m, "{moved_error_m} m, seeded there: {right_error_m} m");
+        assert_eq!(trainer.progress().primitives, n_splats, "no splats are added or removed");
+        assert!(
+            trainer.n_seeds() > n_seeds / 2 && trainer.n_seeds() < 2 * n_seeds,
+            "{} of {n_seeds}",
+            trainer.n_seeds()
+        );
+        trainer.seed().unwrap();
+        assert_eq!(trainer.progress().primitives, n_splats, "the keyframes are not seeded again");
+    }
+
+    #[test]
+    fn points_that_no_keyframe_shows_move_with_the_nearest_camera() {
+        let keyframes = capture(&Miscalibration::none());
+        let shift = Transform::new(Vector3::new(0.0, 0.0, 0.01), Vector3::new(0.0, 0.02, 0.0));
+        let after = |keyframe: &Arc<Keyframe>| Arc::new(keyframe.with_base_correction(&shift));
+        let corrected: Vec<_> = keyframes
+            .iter()
+            .map(|keyframe| CorrectedKeyframe { before: keyframe.clone(), after: after(keyframe) })
+            .collect();
+        let motions = motions(&corrected, |_| None);
+        for point in [Point3::new(0.0, 0.0, 1e3), Point3::new(0.3, 0.1, 0.0)] {
+            let (position, rotation) = moved(&motions, &point).unwrap();
+            assert!((position - shift * point).norm() < 1e-9 * point.coords.norm().max(1.0), "{position} {point}");
+            assert!(rotation.angle_to(&shift.rotation) < 1e-9);
+        }
+        assert!(moved(&[], &Point3::origin()).is_none());
+    }
+}
