@@ -77,9 +77,9 @@ pub struct Growth {
     pub to_seconds: f64,
     /// Median resident memory in that time.
     pub resident_bytes: f64,
-    /// Theil-Sen slope: the median of the rates of change between all pairs of samples.
+    /// Theil-Sen estimate: the median of the rates of change between all pairs of samples.
     pub bytes_per_hour: f64,
-    /// The slope as a percentage of `resident_bytes`.
+    /// The rate as a percentage of `resident_bytes`.
     pub percent_per_hour: f64,
 }
 

@@ -439,7 +439,7 @@ fn save(
     let is_recorded = input_result.recording_error.is_none();
     data_losses.extend(input_result.recording_error.map(|error| format!("the recording is incomplete: {error:#}")));
     data_losses.extend(damage.get().cloned());
-    let corrected = corrected_rigs(rig, &sessions, &folders)?;
+    let corrected = corrected_rigs(rig, &sessions, &folders);
     let stations = input_result.stations.as_ref().map_or(Vec::new(), |stations| stations.reports().to_vec());
     let ending = |(session, out): (Session, PathBuf)| EndingSession {
         details: RunDetails {
@@ -468,7 +468,7 @@ fn save(
     }
     publish_end(&hub, &models);
     listed?;
-    for (rig, file) in corrected {
+    for (rig, file) in corrected? {
         corrected_rig::write(&rig, &file)?;
         log::info!("rig file with the estimated corrections written to {}", file.display());
     }

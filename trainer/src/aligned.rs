@@ -214,8 +214,7 @@ impl<M: Recalibrate + 'static> Aligned<M> {
 
     /// Waits for the result of alignment and applies it.
     fn finish_alignment(&mut self) -> Result<(), Error> {
-        let before: Vec<_> =
-            self.original_keyframes.iter().map(|keyframe| self.alignment_task.corrected(keyframe)).collect();
+        let previous = AlignmentTask::done(self.alignment_task.result().cloned());
         let is_changed = self.alignment_task.finish(&self.original_keyframes)?;
         (self.n_begun, self.due_step) = (None, None);
         let originals = match self.timing {
@@ -227,9 +226,13 @@ impl<M: Recalibrate + 'static> Aligned<M> {
             }
         };
         let Some(alignment) = self.alignment_task.result().filter(|_| is_changed) else { return Ok(()) };
-        let after = originals.iter().map(|keyframe| self.alignment_task.corrected(keyframe));
-        let keyframes: Vec<_> =
-            before.into_iter().zip(after).map(|(before, after)| CorrectedKeyframe { before, after }).collect();
+        let keyframes: Vec<_> = originals
+            .iter()
+            .map(|original| CorrectedKeyframe {
+                before: previous.corrected(original),
+                after: self.alignment_task.corrected(original),
+            })
+            .collect();
         let n_steps = self.model.n_total_steps()?;
         self.model.recalibrate(&keyframes, alignment)?;
         let n_forgotten = n_steps.wrapping_sub(self.model.n_total_steps()?);

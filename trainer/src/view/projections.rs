@@ -76,22 +76,19 @@ fn all_directions(
         (face, (pixel(1) * edge + pixel(0)) as usize, crate::gpu::f32_of(in_face.z))
     };
     let (row_px, n) = (width as usize, (width * height) as usize);
-    let mut picture = Picture {
-        size_px: request.size_px,
-        rgba_srgb: vec![0; 4 * n],
-        depth_m: vec![0.0; if request.depth { n } else { 0 }],
-    };
-    picture.rgba_srgb.par_chunks_mut(4 * row_px).zip(0..height).for_each(|(row, y)| {
-        for (pixel, x) in row.chunks_exact_mut(4).zip(0..) {
-            let (face, at, _) = sample(x, y);
-            pixel.copy_from_slice(&face.rgba_srgb[4 * at..4 * at + 4]);
-        }
-    });
-    picture.depth_m.par_chunks_mut(row_px).zip(0..height).for_each(|(row, y)| {
-        for (depth_m, x) in row.iter_mut().zip(0..) {
+    let mut picture = Picture { size_px: request.size_px, rgba_srgb: vec![0; 4 * n], depth_m: vec![0.0; n] };
+    let rows = picture.rgba_srgb.par_chunks_mut(4 * row_px).zip(picture.depth_m.par_chunks_mut(row_px));
+    rows.zip(0..height).for_each(|((colors, depths), y)| {
+        for ((pixel, depth_m), x) in colors.chunks_exact_mut(4).zip(depths).zip(0..) {
             let (face, at, cosine) = sample(x, y);
-            *depth_m = face.depth_m[at] / cosine;
+            pixel.copy_from_slice(&face.rgba_srgb[4 * at..4 * at + 4]);
+            if request.depth {
+                *depth_m = face.depth_m[at] / cosine;
+            }
         }
     });
+    if !request.depth {
+        picture.depth_m = Vec::new();
+    }
     Ok(picture)
 }

@@ -1,9 +1,8 @@
 //! Corrects the cameras of a model in training: the splats move along with the keyframes that show them.
 //!
-//! A splat that was trained on wrong poses lies where its keyframes agree most. Each keyframe would carry it to where the
-//! same pixel lies after the correction; the splat moves to the mean of these positions, weighted by how well the depth of
-//! each keyframe agrees with it. Coefficients of spherical
-//! harmonics are not rotated, because corrections are a few degrees at most.
+//! For each keyframe, the correction moves the point that the keyframe shows at a pixel and depth. A splat moves to the mean
+//! of these points over the keyframes that show it. A keyframe has more weight the better its depth agrees with the splat.
+//! Coefficients of spherical harmonics are not rotated, because corrections are a few degrees at most.
 
 use super::SplatTrainer;
 use crate::gpu::{Gpu, f32s_of};
@@ -12,10 +11,10 @@ use crate::splat::camera_params::CameraParams;
 use crate::{CorrectedKeyframe, Error, Recalibrate};
 use calibration::{Alignment, CameraCorrection, ParamSet};
 use keyframe::{DepthMap, Keyframe};
-use kinematics::Transform;
+use kinematics::{Intrinsics, Lens, Transform};
 use nalgebra::{Point3, Quaternion, UnitQuaternion, Vector3};
 use rayon::prelude::*;
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
 
 /// Maximum number of keyframes that determine the motion of the splats, spread evenly over all.
@@ -34,11 +33,11 @@ impl Recalibrate for SplatTrainer {
         self.finish_in_flight()?;
         self.abort_trial()?;
         let learned = match self.model.cameras.set.is_empty() {
-            true => None,
-            false => Some(self.camera_corrections()?),
+            true => BTreeMap::new(),
+            false => self.camera_corrections()?,
         };
         let gpu = self.recorder.gpu.clone();
-        let motions = motions(keyframes, |camera| learned.as_ref()?.get(camera));
+        let motions = motions(keyframes, |camera| learned.get(camera));
         move_splats(&gpu, &self.model.splats, &motions)?;
         let after: HashMap<_, _> =
             keyframes.iter().map(|keyframe| (id_of(&keyframe.before), &keyframe.after)).collect();
@@ -69,41 +68,39 @@ fn id_of(keyframe: &Keyframe) -> (Arc<str>, i64) {
     (keyframe.camera.clone(), keyframe.stamp.0)
 }
 
-/// A pinhole camera.
-#[derive(Clone, Copy, Debug)]
-struct Pinhole {
-    camera_from_world: Transform,
+/// A camera at its pose in the world.
+struct PosedCamera {
     world_from_camera: Transform,
-    size_px: [f64; 2],
-    focal_px: [f64; 2],
-    principal_px: [f64; 2],
+    camera_from_world: Transform,
+    intrinsics: Intrinsics,
 }
 
-impl Pinhole {
+impl PosedCamera {
     fn of(keyframe: &Keyframe) -> Self {
         let Keyframe { world_from_camera, size_px, focal_px, principal_px, .. } = *keyframe;
-        let size_px = size_px.map(f64::from);
-        Self { camera_from_world: world_from_camera.inverse(), world_from_camera, size_px, focal_px, principal_px }
+        Self::pinhole(world_from_camera, size_px, focal_px, principal_px)
     }
 
     fn of_depth(depth: &DepthMap) -> Self {
         let DepthMap { world_from_camera, size_px, focal_px, principal_px, .. } = *depth;
-        let size_px = size_px.map(f64::from);
-        Self { camera_from_world: world_from_camera.inverse(), world_from_camera, size_px, focal_px, principal_px }
+        Self::pinhole(world_from_camera, size_px, focal_px, principal_px)
+    }
+
+    fn pinhole(world_from_camera: Transform, size_px: [u32; 2], focal_px: [f64; 2], principal_px: [f64; 2]) -> Self {
+        let intrinsics = Intrinsics { size_px, focal_px, principal_px, lens: Lens::Pinhole, rectified: true };
+        Self { world_from_camera, camera_from_world: world_from_camera.inverse(), intrinsics }
     }
 
     /// Pixel and depth of a point in the world, if the image contains it.
     fn project(&self, point: &Point3<f64>) -> Option<([f64; 2], f64)> {
         let point = self.camera_from_world * point;
-        let px = [0, 1].map(|axis| self.focal_px[axis] * point[axis] / point.z + self.principal_px[axis]);
-        let is_inside = point.z > 0.0 && (0..2).all(|axis| px[axis] >= 0.0 && px[axis] < self.size_px[axis]);
-        is_inside.then_some((px, point.z))
+        let px = self.intrinsics.project(&point.coords)?;
+        self.intrinsics.contains(px).then_some((px, point.z))
     }
 
     /// The point in the world at a pixel and depth.
-    fn point(&self, px: [f64; 2], z: f64) -> Point3<f64> {
-        let ray = [0, 1].map(|axis| (px[axis] - self.principal_px[axis]) / self.focal_px[axis]);
-        self.world_from_camera * Point3::from(Vector3::new(ray[0], ray[1], 1.0) * z)
+    fn point(&self, px: [f64; 2], z: f64) -> Option<Point3<f64>> {
+        Some(self.world_from_camera * Point3::from(self.intrinsics.unproject(px)? * z))
     }
 }
 
@@ -114,12 +111,12 @@ fn reading_m(depth: &DepthMap, px: [f64; 2]) -> f64 {
     depth.depth_m[y * depth.size_px[0] as usize + x].into()
 }
 
-/// The motion of what one keyframe shows.
+/// The effect of the correction on the points that one keyframe shows.
 struct Motion {
-    before: Pinhole,
-    after: Pinhole,
+    before: PosedCamera,
+    after: PosedCamera,
     /// Camera and readings of the depth before the correction.
-    depth: Option<(Pinhole, DepthMap)>,
+    depth: Option<(PosedCamera, DepthMap)>,
     rotation: UnitQuaternion<f64>,
 }
 
@@ -137,7 +134,7 @@ impl Motion {
             Some(error_frac) => 1.0 / (1.0 + (error_frac / AGREEMENT_FRAC).powi(2)),
             None => WITHOUT_DEPTH,
         };
-        Some((self.after.point(px, z), weight))
+        Some((self.after.point(px, z)?, weight))
     }
 }
 
@@ -151,9 +148,9 @@ fn motions<'a>(keyframes: &[CorrectedKeyframe], learned: impl Fn(&str) -> Option
             learned(&before.camera).map_or_else(|| before.clone(), |learned| Arc::new(learned.corrected(before)));
         let rotation = after.world_from_camera.rotation * before.world_from_camera.rotation.inverse();
         Motion {
-            before: Pinhole::of(&before),
-            after: Pinhole::of(after),
-            depth: before.depth.clone().map(|depth| (Pinhole::of_depth(&depth), depth)),
+            before: PosedCamera::of(&before),
+            after: PosedCamera::of(after),
+            depth: before.depth.clone().map(|depth| (PosedCamera::of_depth(&depth), depth)),
             rotation,
         }
     };
@@ -215,7 +212,7 @@ mod tests {
         let depths: Vec<_> = keyframes
             .iter()
             .filter_map(|keyframe| keyframe.depth.clone())
-            .map(|depth| (Pinhole::of_depth(&depth), depth))
+            .map(|depth| (PosedCamera::of_depth(&depth), depth))
             .collect();
         let mut errors = Vec::new();
         for mean in trainer.arrays().unwrap().means {
