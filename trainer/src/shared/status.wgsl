@@ -2,6 +2,7 @@
 
 const N_SPLATS = 0u;       // written by the host
 const N_ENTRIES = 1u;      // of this view's lists
+const N_SLOTS = 2u;        // intersections of splats with tiles in this view
 const FAILED = 3u;         // sticky: a buffer was too small; training stops until the host has grown it
 const NEED_ENTRIES = 4u;   // maximum number of entries requested since the host last read this counter
 const NEED_SLOTS = 5u;     // likewise for intersections

@@ -17,7 +17,8 @@ struct Tile {
     in_grid: bool,
     corner: vec2u,     // pixels
     in_bin: u32,       // the tile's bit in the entries' masks and its plane of tile_bits
-    begin: u32,        // of the bin's list
+    list_begin: u32,   // of the bin's list
+    begin: u32,        // of the entries to process
     end: u32,
 }
 
@@ -29,7 +30,8 @@ fn tile_at(tile: u32) -> Tile {
     out.in_bin = position.y % BIN_TILES * BIN_TILES + position.x % BIN_TILES;
     if out.in_grid && status[FAILED] == 0u {
         let bin = position.y / BIN_TILES * n_bins(view.n_tiles).x + position.x / BIN_TILES;
-        out.begin = bin_starts[bin];
+        out.list_begin = bin_starts[bin];
+        out.begin = out.list_begin;
         out.end = bin_starts[bin + 1u];
     }
     return out;

@@ -177,27 +177,53 @@ pub(super) fn target_of(image: &RenderedImage, size_px: [u32; 2]) -> loss_refere
 
 #[test]
 fn gradients_match_the_twin() {
+    for (view, seed) in [(scene::tilted_view(), 3), (scene::rolling_view(), 4)] {
+        check_gradients_with_loss(&view, &scene::small_scene(seed, 40));
+    }
+}
+
+/// Lists of several segments, of splats that touch more tiles than one lane of `update` sums.
+#[test]
+fn gradients_of_long_lists_match_the_twin() {
+    let view = scene::tilted_view();
+    let view = View {
+        focal_px: view.focal_px.map(|focal_px| 4.0 * focal_px),
+        principal_px: view.principal_px.map(|principal_px| 4.0 * principal_px),
+        size_px: view.size_px.map(|size_px| 4 * size_px),
+        ..view
+    };
+    let world_from_camera = view.camera_from_world.inverse();
+    let mut splats = scene::small_scene(5, 400);
+    for (ix, splat) in splats.iter_mut().enumerate() {
+        // Depths that differ, in an order unlike that of the indices.
+        let z = 1.5 + 0.0025 * (ix * 149 % 400) as f64;
+        splat.mean = (world_from_camera * nalgebra::Point3::new(splat.mean[0], splat.mean[1], z)).coords.into();
+        splat.log_scale = splat.log_scale.map(|log_scale| 2.5 + 0.5 * log_scale); // Far larger than the image.
+        splat.opacity_logit = -4.4 + 0.1 * splat.opacity_logit;
+    }
+    check_gradients_with_loss(&view, &splats);
+}
+
+/// Compares the gradients of a loss with color, D-SSIM and depth, for both kernel variants.
+fn check_gradients_with_loss(view: &View, splats: &[Splat]) {
+    let rendered = reference::render(view, splats);
+    let unambiguous = unambiguous_pixels(view, splats);
+    let mut target = target_of(&rendered, view.size_px);
+    for (visible, unambiguous) in target.visible.iter_mut().zip(&unambiguous) {
+        *visible &= unambiguous;
+    }
+    for (depth_m, unambiguous) in target.depth_m.iter_mut().zip(&unambiguous) {
+        *depth_m = if *unambiguous { f64::from(f32_of(*depth_m)) } else { 0.0 };
+    }
+    let weights = loss_reference::Weights {
+        dssim_frac: 0.25,
+        depth_per_m: 0.5,
+        depth_clip_m: 50.0,
+        background_rgb: [0.125, 0.25, 0.5],
+    };
+    let (_, upstream) = loss_reference::loss(&rendered, &target, &weights);
     for options in adapter_options() {
-        for (view, seed) in [(scene::tilted_view(), 3), (scene::rolling_view(), 4)] {
-            let splats = scene::small_scene(seed, 40);
-            let rendered = reference::render(&view, &splats);
-            let unambiguous = unambiguous_pixels(&view, &splats);
-            let mut target = target_of(&rendered, view.size_px);
-            for (visible, unambiguous) in target.visible.iter_mut().zip(&unambiguous) {
-                *visible &= unambiguous;
-            }
-            for (depth_m, unambiguous) in target.depth_m.iter_mut().zip(&unambiguous) {
-                *depth_m = if *unambiguous { f64::from(f32_of(*depth_m)) } else { 0.0 };
-            }
-            let weights = loss_reference::Weights {
-                dssim_frac: 0.25,
-                depth_per_m: 0.5,
-                depth_clip_m: 50.0,
-                background_rgb: [0.125, 0.25, 0.5],
-            };
-            let (_, upstream) = loss_reference::loss(&rendered, &target, &weights);
-            check_gradients(&options, &view, &splats, &target, &weights, &upstream);
-        }
+        check_gradients(&options, view, splats, &target, &weights, &upstream);
     }
 }
 
@@ -261,7 +287,7 @@ fn check_gradients(
     let gradients_only = TrainPipelines::gradients_only(gpu).unwrap();
     let mut passes = Passes::default();
     let view_passes = fixture.passes();
-    view_passes.draw(&mut passes, &fixture.draw);
+    view_passes.draw_for_backward(&mut passes, &fixture.draw, &fixture.train);
     view_passes.compare(&mut passes, &fixture.train, &target_buffers.target());
     view_passes.backward(&mut passes, &fixture.train);
     view_passes.update(&mut passes, &gradients_only, &rule, true);
@@ -454,7 +480,7 @@ fn hidden_splats_have_no_gradient() {
         let gradients_only = TrainPipelines::gradients_only(gpu).unwrap();
         let mut passes = Passes::default();
         let view_passes = fixture.passes();
-        view_passes.draw(&mut passes, &fixture.draw);
+        view_passes.draw_for_backward(&mut passes, &fixture.draw, &fixture.train);
         view_passes.backward(&mut passes, &fixture.train);
         view_passes.update(&mut passes, &gradients_only, &rule, true);
         passes.submit(gpu);
@@ -516,7 +542,7 @@ fn camera_params_start_at_zero_and_step_by_their_rate() {
         let mut passes = Passes::default();
         cameras.correct(gpu, &mut passes, &fixture.train, &fixture.view, &lens);
         let view_passes = ViewPasses { view: &cameras.corrected, ..fixture.passes() };
-        view_passes.draw(&mut passes, &fixture.draw);
+        view_passes.draw_for_backward(&mut passes, &fixture.draw, &fixture.train);
         view_passes.compare(&mut passes, &fixture.train, &Target { gains: &cameras.gains, ..target_buffers.target() });
         view_passes.backward(&mut passes, &fixture.train);
         view_passes.update(&mut passes, &fixture.train.update_with_camera, &rule, true);

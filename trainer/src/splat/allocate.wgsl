@@ -2,7 +2,8 @@
 //
 // threads   one workgroup of 256
 // reads     view, model, capacity, bin_totals [n_bins]
-// writes    bin_starts [n_bins + 1], block_slots [n_blocks] (counts become offsets, in place), status
+// writes    bin_starts [n_bins + 1], block_slots [n_blocks] (counts become offsets, in place), status, segment_counts [2]
+//           (zeros)
 
 #import view
 #import model
@@ -18,6 +19,7 @@
 @group(0) @binding(4) var<storage, read_write> bin_starts: array<u32>;
 @group(0) @binding(5) var<storage, read_write> block_slots: array<u32>;
 @group(0) @binding(6) var<storage, read_write> status: array<u32>;
+@group(0) @binding(7) var<storage, read_write> segment_counts: array<u32>;
 
 @compute @workgroup_size(256)
 fn main(@builtin(local_invocation_index) lane: u32) {
@@ -31,6 +33,9 @@ fn main(@builtin(local_invocation_index) lane: u32) {
         let fits = n_entries <= capacity.n_entries && (n_slots <= capacity.n_slots || capacity.n_slots == 0u);
         status[FURTHEST] = 0u; // Reset for the next view; this one is sorted already.
         status[NEAREST] = 0u;
+        status[N_SLOTS] = n_slots;
+        segment_counts[0] = 0u;
+        segment_counts[1] = 0u;
         status[N_ENTRIES] = select(0u, n_entries, fits);
         if !fits { status[FAILED] = 1u; }
     }

@@ -232,7 +232,7 @@ impl KernelBench {
     /// Records the passes that draw the picture and compare it with the target.
     fn record_gradients(&self, passes: &mut Passes) -> ViewPasses<'_> {
         let view = self.view_passes();
-        view.draw(passes, &self.draw);
+        view.draw_for_backward(passes, &self.draw, &self.train);
         view.compare(
             passes,
             &self.train,

@@ -242,6 +242,12 @@ pub(crate) struct Scratch {
     pub(crate) tile_bits: Buffer,
     pub(crate) gradients: Buffer,
     pub(crate) camera_sums: Buffer,
+    /// Parts of the tiles' lists that `backward` processes; see shared/segment.wgsl.
+    pub(crate) segments: Buffer,
+    pub(crate) segment_counts: Buffer,
+    pub(crate) segment_states: Buffer,
+    /// Capacity for segments and for pieces of the hidden ends of lists, not counting one or two per tile.
+    pub(crate) n_segments: [u32; 2],
 }
 
 /// Capacities of a [`Scratch`].
@@ -260,10 +266,12 @@ impl Scratch {
         let words = |name: &str, n: u32| gpu.storage(name, 4 * u64::from(n.max(1)));
         let ScratchSize { n_splats, n_entries, n_slots, n_bins } = size;
         let n_blocks = n_splats.div_ceil(BLOCK);
+        let n_segments = if n_slots > 0 && pipelines.has_segments { n_segments(n_entries, n_slots) } else { [0; 2] };
+        let segment_bytes = 16 * (u64::from(n_segments[0]) + u64::from(n_segments[1]) + 48 * u64::from(n_bins));
         let per_bin = |name: &str, n: u32| gpu.storage(name, 4 * u64::from(n_bins) * u64::from(n.max(1)));
         Ok(Self {
             n_entries,
-            capacity: gpu.uniform_with("splat.capacity", &Capacity { n_entries, n_slots, unused: [0; 2] }),
+            capacity: gpu.uniform_with("splat.capacity", &Capacity { n_entries, n_slots, n_segments: n_segments[0], unused: 0 }),
             projected_splats: gpu.storage("splat.projected_splats", 48 * u64::from(n_splats))?,
             tile_counts: words("splat.tile_counts", n_splats)?,
             touched: gpu.storage("splat.touched", 12 * u64::from(n_splats))?,
@@ -279,8 +287,18 @@ impl Scratch {
             tile_bits: gpu.storage("splat.tile_bits", 64 * u64::from(n_entries.div_ceil(32).max(1)))?,
             gradients: gpu.storage("splat.gradients", 48 * u64::from(n_slots))?,
             camera_sums: gpu.storage("splat.camera_sums", if n_slots > 0 { 48 * u64::from(n_blocks) } else { 0 })?,
+            segments: gpu.storage("splat.segments", segment_bytes)?,
+            segment_counts: words("splat.segment_counts", 2)?,
+            segment_states: gpu.storage("splat.segment_states", 20 * 256 * u64::from(n_segments[0]))?,
+            n_segments,
         })
     }
+}
+
+/// Maximum number of segments after the first of each tile, and of pieces of hidden ends (without two per tile), for
+/// lists of this length; see shared/segment.wgsl.
+fn n_segments(n_entries: u32, n_slots: u32) -> [u32; 2] {
+    [(n_slots / 128).min(2 * 16384), n_entries.div_ceil(64)]
 }
 
 /// Buffers of one picture, and of its gradients in training.

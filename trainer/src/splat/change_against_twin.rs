@@ -114,7 +114,7 @@ fn optimizer_steps_match_the_twin() {
 
         let mut passes = Passes::default();
         let view_passes = fixture.passes();
-        view_passes.draw(&mut passes, &fixture.draw);
+        view_passes.draw_for_backward(&mut passes, &fixture.draw, &fixture.train);
         view_passes.compare(&mut passes, &fixture.train, &target_buffers.target());
         view_passes.backward(&mut passes, &fixture.train);
         view_passes.update(&mut passes, &fixture.train.update, &rule, false);

@@ -75,14 +75,21 @@ macro_rules! blend_sources {
     ($($source:expr),*) => {
         &[
             VIEW, STATUS, MODEL, PROJECTION, GRADIENT, TILES, BINS,
-            source!("rasterize_bindings"), source!("backward_bindings"), source!("coverage"), source!("tile"), $($source),*
+            source!("rasterize_bindings"), source!("backward_bindings"), source!("coverage"), source!("tile"),
+            source!("capacity"), $($source),*
         ]
     };
 }
-const BLEND: &[Source] =
-    blend_sources!(source!("pixels", "pixels_2"), source!("tile_queue"), source!("sums", "sums_subgroup"));
-const BLEND_BY_MEMORY: &[Source] =
-    blend_sources!(source!("pixels", "pixels_2"), source!("tile_queue"), source!("sums", "sums_memory"));
+/// Imports of the kernels for GPUs.
+macro_rules! tile_sources {
+    ($($source:expr),*) => {
+        blend_sources!(source!("pixels", "pixels_2"), source!("tile_queue"), source!("segment"), $($source),*)
+    };
+}
+const RASTERIZE: &[Source] = tile_sources!(source!("segments", "segments_none"));
+const RASTERIZE_SEGMENTS: &[Source] = tile_sources!(source!("segments", "segments_stored"));
+const BACKWARD: &[Source] = tile_sources!(source!("sums", "sums_subgroup"));
+const BACKWARD_BY_MEMORY: &[Source] = tile_sources!(source!("sums", "sums_memory"));
 const BLEND_STRIPS: &[Source] = blend_sources!(source!("pixels", "pixels_4"), source!("strips"));
 
 macro_rules! kernel {
@@ -103,10 +110,11 @@ macro_rules! kernel {
 /// The per-pixel kernels, in the variant that suits the adapter.
 struct Blend {
     rasterize: Kernel,
+    /// Also divides the lists of the tiles into segments, if `backward` processes segments.
+    rasterize_segments: Option<Kernel>,
     backward: Kernel,
     /// Number of lanes per subgroup, if `backward` needs it.
     subgroup: Option<u32>,
-    in_strips: bool,
 }
 
 fn blend(gpu: &Gpu) -> Blend {
@@ -114,21 +122,21 @@ fn blend(gpu: &Gpu) -> Blend {
         // Software adapters: no GPU has subgroups of exactly 8 lanes.
         Some(8) => Blend {
             rasterize: kernel!("rasterize_strips", BLEND_STRIPS),
+            rasterize_segments: None,
             backward: kernel!("backward_strips", BLEND_STRIPS),
             subgroup: None,
-            in_strips: true,
         },
         Some(lanes) if (16..=128).contains(&lanes) => Blend {
-            rasterize: kernel!("rasterize", BLEND),
-            backward: kernel!("backward", BLEND),
+            rasterize: kernel!("rasterize", RASTERIZE),
+            rasterize_segments: Some(kernel!("rasterize", RASTERIZE_SEGMENTS)),
+            backward: kernel!("backward", BACKWARD),
             subgroup: Some(lanes),
-            in_strips: false,
         },
         _ => Blend {
-            rasterize: kernel!("rasterize", BLEND),
-            backward: kernel!("backward", BLEND_BY_MEMORY),
+            rasterize: kernel!("rasterize", RASTERIZE),
+            rasterize_segments: Some(kernel!("rasterize", RASTERIZE_SEGMENTS)),
+            backward: kernel!("backward", BACKWARD_BY_MEMORY),
             subgroup: None,
-            in_strips: false,
         },
     }
 }
@@ -143,7 +151,8 @@ pub(crate) const KERNELS: &[Kernel] = &[
     kernel!("allocate"),
     kernel!("emit"),
     kernel!("tile_bits"),
-    kernel!("rasterize", BLEND),
+    kernel!("rasterize", RASTERIZE),
+    kernel!("rasterize", RASTERIZE_SEGMENTS),
     kernel!("rasterize_strips", BLEND_STRIPS),
     kernel!("finish"),
     kernel!("loss", "ssim", SHARED),
@@ -151,8 +160,8 @@ pub(crate) const KERNELS: &[Kernel] = &[
     kernel!("loss", "ssim_upstream_strips", LOSS_STRIPS),
     kernel!("loss", "loss_backward", SHARED),
     kernel!("loss", "loss_backward", LOSS_STRIPS),
-    kernel!("backward", BLEND),
-    kernel!("backward", BLEND_BY_MEMORY),
+    kernel!("backward", BACKWARD),
+    kernel!("backward", BACKWARD_BY_MEMORY),
     kernel!("backward_strips", BLEND_STRIPS),
     kernel!("update"),
     kernel!("update", WITH_CAMERA),
@@ -181,10 +190,13 @@ pub(crate) struct DrawPipelines {
     pub(crate) tile_bits: Pipeline,
     pub(crate) rasterize: Pipeline,
     pub(crate) finish: Pipeline,
+    /// Whether training divides the lists of the tiles into segments.
+    pub(crate) has_segments: bool,
 }
 
 impl DrawPipelines {
     pub(crate) fn new(gpu: &Gpu) -> Result<Self, Error> {
+        let blend = blend(gpu);
         Ok(Self {
             sort: RadixSort::new(gpu)?,
             project: Pipeline::new(gpu, kernel!("project"), &[])?,
@@ -194,8 +206,9 @@ impl DrawPipelines {
             allocate: Pipeline::new(gpu, kernel!("allocate"), &[])?,
             emit: Pipeline::new(gpu, kernel!("emit"), &[])?,
             tile_bits: Pipeline::new(gpu, kernel!("tile_bits"), &[])?,
-            rasterize: Pipeline::new(gpu, blend(gpu).rasterize, &[])?,
+            rasterize: Pipeline::new(gpu, blend.rasterize, &[])?,
             finish: Pipeline::new(gpu, kernel!("finish"), &[])?,
+            has_segments: blend.rasterize_segments.is_some(),
         })
     }
 }
@@ -220,6 +233,8 @@ pub(crate) struct TrainPipelines {
     pub(crate) ssim: Ssim,
     pub(crate) loss: Pipeline,
     pub(crate) loss_without_ssim: Pipeline,
+    /// Also divides the lists of the tiles into segments for `backward`. `None` if `backward` needs no segments.
+    pub(crate) rasterize_segments: Option<Pipeline>,
     pub(crate) backward: Pipeline,
     pub(crate) update: Pipeline,
     pub(crate) update_with_camera: Pipeline,
@@ -239,7 +254,7 @@ impl TrainPipelines {
     pub(crate) fn new(gpu: &Gpu) -> Result<Self, Error> {
         let blend = blend(gpu);
         let lanes: Vec<_> = blend.subgroup.map(|lanes| ("SUBGROUP", f64::from(lanes))).into_iter().collect();
-        let in_strips = blend.in_strips;
+        let in_strips = blend.rasterize_segments.is_none();
         let loss = if in_strips { LOSS_STRIPS } else { SHARED };
         let ssim = if in_strips {
             Ssim::Strips {
@@ -253,6 +268,7 @@ impl TrainPipelines {
             ssim,
             loss: Pipeline::new(gpu, kernel!("loss", "loss_backward", loss), &[("SSIM", 1.0)])?,
             loss_without_ssim: Pipeline::new(gpu, kernel!("loss", "loss_backward", loss), &[("SSIM", 0.0)])?,
+            rasterize_segments: blend.rasterize_segments.map(|kernel| Pipeline::new(gpu, kernel, &[])).transpose()?,
             backward: Pipeline::new(gpu, blend.backward, &lanes)?,
             update: Pipeline::new(gpu, kernel!("update"), &[])?,
             update_with_camera: Pipeline::new(gpu, kernel!("update", WITH_CAMERA), &[])?,
@@ -361,7 +377,7 @@ mod tests {
                 image_decay
             ]
         );
-        assert_layout!(KERNELS, Capacity, [n_entries, n_slots, unused]);
+        assert_layout!(KERNELS, Capacity, [n_entries, n_slots, n_segments, unused]);
         assert_layout!(KERNELS, Gathering, [n_kept, n_planes, words, from_capacity, to_capacity]);
     }
 

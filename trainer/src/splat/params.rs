@@ -18,7 +18,8 @@ pub(crate) struct Model {
 pub(crate) struct Capacity {
     pub(crate) n_entries: u32,
     pub(crate) n_slots: u32,
-    pub(crate) unused: [u32; 2],
+    pub(crate) n_segments: u32,
+    pub(crate) unused: u32,
 }
 
 /// `Rule` of update.wgsl: learning rates and costs.

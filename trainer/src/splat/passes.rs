@@ -128,7 +128,47 @@ fn n_color_strips(size_px: [u32; 2]) -> u64 {
 impl ViewPasses<'_> {
     /// Projects, sorts, bins and rasterizes the splats.
     pub(crate) fn draw(&self, passes: &mut Passes, pipelines: &DrawPipelines) {
-        let Self { gpu, splats, scratch, image_buffers, status, view, size_px } = *self;
+        self.list(passes, pipelines);
+        passes.dispatch(self.gpu, &pipelines.rasterize, u64::from(n_tiles(self.size_px)), &self.rasterized());
+    }
+
+    /// [`ViewPasses::draw`], followed by [`ViewPasses::backward`].
+    pub(crate) fn draw_for_backward(&self, passes: &mut Passes, draw: &DrawPipelines, train: &TrainPipelines) {
+        let Some(rasterize) = &train.rasterize_segments else { return self.draw(passes, draw) };
+        self.list(passes, draw);
+        let buffers = [&self.rasterized()[..], &self.segments()].concat();
+        passes.dispatch(self.gpu, rasterize, u64::from(n_tiles(self.size_px)), &buffers);
+    }
+
+    /// Buffers of `rasterize`.
+    fn rasterized(&self) -> [(&'static str, &Buffer); 9] {
+        let Self { scratch, image_buffers, .. } = *self;
+        [
+            ("view", self.view),
+            ("status", self.status),
+            ("bin_starts", &scratch.bin_starts),
+            ("tile_bits", &scratch.tile_bits),
+            ("entries", &scratch.entries),
+            ("projected_splats", &scratch.projected_splats),
+            ("image", &image_buffers.image),
+            ("depth", &image_buffers.depth),
+            ("last", &image_buffers.last),
+        ]
+    }
+
+    /// Buffers of the segments of the lists.
+    fn segments(&self) -> [(&'static str, &Buffer); 4] {
+        [
+            ("capacity", &self.scratch.capacity),
+            ("segments", &self.scratch.segments),
+            ("segment_counts", &self.scratch.segment_counts),
+            ("segment_states", &self.scratch.segment_states),
+        ]
+    }
+
+    /// Projects, sorts and bins the splats.
+    fn list(&self, passes: &mut Passes, pipelines: &DrawPipelines) {
+        let Self { gpu, splats, scratch, status, view, size_px, .. } = *self;
         let n_blocks = u64::from(splats.n_splats.div_ceil(BLOCK));
         let [view, model] = [("view", view), ("model", &splats.model)];
         passes.dispatch(
@@ -174,7 +214,7 @@ impl ViewPasses<'_> {
         passes.dispatch(gpu, &pipelines.sum_bins, n_groups * n_windows, &[view, model, bin_counts, group_counts]);
         let scanned = [view, model, group_counts, bin_totals];
         passes.dispatch(gpu, &pipelines.scan_bins, u64::from(n_bins(size_px)), &scanned);
-        let allocated = [view, model, ("capacity", &scratch.capacity), bin_totals, bin_starts, block_slots, status];
+        let allocated = [view, model, ("capacity", &scratch.capacity), bin_totals, bin_starts, block_slots, status, ("segment_counts", &scratch.segment_counts)];
         passes.dispatch(gpu, &pipelines.allocate, 1, &allocated);
         let entries = ("entries", &scratch.entries);
         let emitted = [
@@ -195,22 +235,6 @@ impl ViewPasses<'_> {
         let tile_bits = ("tile_bits", &scratch.tile_bits);
         let n_groups = u64::from(scratch.n_entries.div_ceil(512));
         passes.dispatch(gpu, &pipelines.tile_bits, n_groups, &[status, entries, tile_bits]);
-        passes.dispatch(
-            gpu,
-            &pipelines.rasterize,
-            u64::from(n_tiles(size_px)),
-            &[
-                view,
-                status,
-                bin_starts,
-                tile_bits,
-                entries,
-                projected_splats,
-                ("image", &image_buffers.image),
-                ("depth", &image_buffers.depth),
-                ("last", &image_buffers.last),
-            ],
-        );
     }
 
     /// Packs the picture for display.
@@ -275,24 +299,27 @@ impl ViewPasses<'_> {
 
     /// Propagates the gradients from the pixels to the intersections.
     pub(crate) fn backward(&self, passes: &mut Passes, pipelines: &TrainPipelines) {
-        let Self { gpu, scratch, image_buffers, status, view, size_px, .. } = *self;
-        passes.dispatch(
-            gpu,
-            &pipelines.backward,
-            u64::from(n_tiles(size_px)),
-            &[
-                ("view", view),
-                ("status", status),
-                ("bin_starts", &scratch.bin_starts),
-                ("tile_bits", &scratch.tile_bits),
-                ("entries", &scratch.entries),
-                ("projected_splats", &scratch.projected_splats),
-                ("upstream", &image_buffers.upstream),
-                ("pixel_totals", &image_buffers.pixel_totals),
-                ("last", &image_buffers.last),
-                ("gradients", &scratch.gradients),
-            ],
-        );
+        let Self { gpu, scratch, image_buffers, .. } = *self;
+        let n_tiles = u64::from(n_tiles(self.size_px));
+        let mut buffers = vec![
+            ("view", self.view),
+            ("status", self.status),
+            ("bin_starts", &scratch.bin_starts),
+            ("tile_bits", &scratch.tile_bits),
+            ("entries", &scratch.entries),
+            ("projected_splats", &scratch.projected_splats),
+            ("upstream", &image_buffers.upstream),
+            ("pixel_totals", &image_buffers.pixel_totals),
+            ("last", &image_buffers.last),
+            ("gradients", &scratch.gradients),
+        ];
+        let mut n_groups = n_tiles;
+        if pipelines.rasterize_segments.is_some() {
+            buffers.extend(self.segments());
+            let [n_further, n_hidden] = scratch.n_segments.map(u64::from);
+            n_groups = n_tiles + n_further + n_hidden + 2 * n_tiles;
+        }
+        passes.dispatch(gpu, &pipelines.backward, n_groups, &buffers);
     }
 
     /// Adds each splat's contribution to the picture to `contributions`. Requires a previous [`ViewPasses::backward`]

@@ -1,9 +1,9 @@
 // rasterize: blend each tile's splats front to back.
 //
-// threads   32 per tile; each lane handles two pixels in each quarter of the tile
+// threads   128 per tile, 32 per quarter of 8 x 8 pixels; each lane handles two pixels
 // reads     view, status, bin_starts, tile_bits, entries, projected_splats
 // writes    image [n_pixels] (premultiplied rgb, transmittance), depth [n_pixels] (premultiplied), last [n_pixels]
-//           (one past the last contributor, counted from the start of the bin's list)
+//           (one past the last contributor, counted from the start of the bin's list); in training, see `segments`
 // twin      splat/reference/rasterize.rs
 // source    Kerbl et al. 2023, section 6
 
@@ -11,64 +11,84 @@
 #import pixels
 #import coverage
 #import tile_queue
+#import segments
+
+const LANES = 128u;
 
 var<workgroup> wg_tile: Tile;
+var<workgroup> wg_reaching: array<atomic<u32>, 16>; // [quarters, BATCH / 32]: the splats of the batch that may touch the quarter
 var<workgroup> wg_n_done: atomic<u32>;
 var<workgroup> wg_all_done: u32;
 
-fn blend_in(blend: ptr<function, Blend>, splat: ProjectedSplat, dx: Px, dy: f32) {
-    let power = power_at(splat.conic, dx, dy);
-    let hit = (*blend).live & within_reach(splat.conic, power);
-    *blend = blended(*blend, hit, power, splat.position.wz, splat.color.rgb, bitcast<u32>(splat.color.w));
-}
-
-fn on_image(tile: Tile, first: vec2u) -> PxB {
-    return (PxU(first.x) + INDEX < PxU(view.size_px.x)) & PxB(tile.in_grid && first.y < view.size_px.y);
+// Sets `wg_reaching`. Every lane must call it.
+fn assign_to_quarters(lane: u32, n: u32) {
+    if lane < n {
+        for (var quarter = 0u; quarter < 4u; quarter++) {
+            if (wg_quarters[lane] & (1u << quarter)) != 0u { atomicOr(&wg_reaching[quarter * 4u + lane / 32u], 1u << (lane % 32u)); }
+        }
+    }
+    workgroupBarrier(); // All splats are assigned.
 }
 
 @compute @workgroup_size(LANES)
 fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
+    let tile_ix = folded(wg, n_wgs);
     if lane == 0u {
-        wg_tile = tile_at(folded(wg, n_wgs));
+        wg_tile = tile_at(tile_ix);
         atomicStore(&wg_n_done, 0u);
     }
     let tile = workgroupUniformLoad(&wg_tile); // Also orders the zeroing before the first `atomicAdd`.
-    let first = tile.corner + lane_px(lane);
+    begin_segments(lane, tile_ix, tile);
+    let quarter = lane / 32u;
+    let first = tile.corner + 8u * vec2u(quarter % 2u, quarter / 2u) + lane_px(lane % 32u);
     let center_x = f32(first.x) + 0.5 + RAMP;
     let center_y = f32(first.y) + 0.5;
-    // Four named variables instead of an array, because arrays with variable indices are stored in memory.
-    var a = unblended(on_image(tile, first));
-    var b = unblended(on_image(tile, first + vec2u(8u, 0u)));
-    var c = unblended(on_image(tile, first + vec2u(0u, 8u)));
-    var d = unblended(on_image(tile, first + vec2u(8u, 8u)));
+    let on_image = (PxU(first.x) + INDEX < PxU(view.size_px.x)) & PxB(tile.in_grid && first.y < view.size_px.y);
+    var blend = unblended(on_image);
     var counted = false;
     var all_done = false;
-    for (var word = tile.begin / 32u; word * 32u < tile.end && !all_done; word += WORDS) {
-        let n_queued = queue_words(lane, word, tile);
-        for (var batch = 0u; batch < n_queued && !all_done; batch += BATCH) {
+    var n_batches = 0u;
+    var n_queued = 0u;
+    var end = tile.end;
+    var word = tile.begin / 32u;
+    while word * 32u < tile.end && !all_done {
+        while n_queued < BATCH && word * 32u < tile.end {
+            n_queued = queue_words(lane, word, tile, n_queued);
+            word += WORDS;
+        }
+        let n_complete = select(n_queued / BATCH * BATCH, n_queued, word * 32u >= tile.end);
+        var batch = 0u;
+        while batch < n_complete && !all_done {
+            begin_segment(lane, n_batches, tile_ix, tile, wg_queue[batch], blend);
+            n_batches++;
+            if lane < 16u { atomicStore(&wg_reaching[lane], 0u); }
             take_batch(lane, batch, n_queued, tile);
-            let n = min(n_queued - batch, BATCH);
-            for (var i = 0u; i < n; i++) {
-                let splat = wg_splats[i];
-                let quarters = wg_quarters[i];
-                let dx = splat.position.x - center_x;
-                let dy = splat.position.y - center_y;
-                if (quarters & 1u) != 0u { blend_in(&a, splat, dx, dy); }
-                if (quarters & 2u) != 0u { blend_in(&b, splat, dx - 8.0, dy); }
-                if (quarters & 4u) != 0u { blend_in(&c, splat, dx, dy - 8.0); }
-                if (quarters & 8u) != 0u { blend_in(&d, splat, dx - 8.0, dy - 8.0); }
+            assign_to_quarters(lane, n_queued - batch);
+            for (var part = 0u; part < BATCH / 32u; part++) {
+                var bits = atomicLoad(&wg_reaching[quarter * 4u + part]);
+                while bits != 0u && any(blend.live) {
+                    let splat = wg_splats[32u * part + firstTrailingBit(bits)];
+                    bits &= bits - 1u;
+                    let power = power_at(splat.conic, splat.position.x - center_x, splat.position.y - center_y);
+                    let hit = blend.live & within_reach(splat.conic, power);
+                    blend = blended(blend, hit, power, splat.position.wz, splat.color.rgb, bitcast<u32>(splat.color.w));
+                }
             }
-            if !counted && !any(a.live | b.live | c.live | d.live) {
+            if !counted && !any(blend.live) {
                 counted = true;
                 atomicAdd(&wg_n_done, 1u);
             }
             workgroupBarrier(); // Every finished lane has been counted.
             if lane == 0u { wg_all_done = atomicLoad(&wg_n_done); }
             all_done = workgroupUniformLoad(&wg_all_done) == LANES;
+            batch += BATCH;
+        }
+        if all_done {
+            end = wg_queue[min(batch, n_queued) - 1u] + 1u;
+        } else {
+            n_queued = keep_rest(lane, batch, n_queued);
         }
     }
-    write_pixels(first, on_image(tile, first), a);
-    write_pixels(first + vec2u(8u, 0u), on_image(tile, first + vec2u(8u, 0u)), b);
-    write_pixels(first + vec2u(0u, 8u), on_image(tile, first + vec2u(0u, 8u)), c);
-    write_pixels(first + vec2u(8u, 8u), on_image(tile, first + vec2u(8u, 8u)), d);
+    end_segments(lane, tile_ix, tile, end);
+    write_pixels(first, on_image, blend);
 }

@@ -47,7 +47,7 @@ struct Rule {
 @group(0) @binding(2) var<uniform> rule: Rule;
 @group(0) @binding(3) var<storage, read> tile_counts: array<u32>;
 @group(0) @binding(4) var<storage, read> slot_begins: array<u32>;
-@group(0) @binding(5) var<storage, read> gradients: array<Gradient>;
+@group(0) @binding(5) var<storage, read> gradients: array<vec4f>; // [n_slots, 3], parts of `Gradient`
 @group(0) @binding(6) var<storage, read_write> means: array<vec4f>;
 @group(0) @binding(7) var<storage, read_write> rotations: array<vec4f>;
 @group(0) @binding(8) var<storage, read_write> shapes: array<vec4f>;
@@ -110,34 +110,77 @@ struct CameraGradient {
 
 #import camera_sums
 
+// Splats with more intersections are summed by 32 lanes.
+const MAX_SLOTS_PER_LANE = 16u;
+const N_TEAMS = 8u;                           // of 32 lanes: 10 rows of slots for each part of the gradient
+const TEAM_ROWS = 10u;
+var<workgroup> wg_n_large: atomic<u32>;
+var<workgroup> wg_n_large_read: u32;
+var<workgroup> wg_large: array<u32, 256>;     // large splats of the block
+var<workgroup> wg_parts: array<vec4f, 256>;   // [N_TEAMS, 32]
+
 @compute @workgroup_size(256)
 fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
     let block = folded(wg, n_wgs);
     let splat_ix = block * 256u + lane;
+    let exists = splat_ix < model.n_splats && atomicLoad(&status[FAILED]) == 0u;
+    var n_touched = 0u;
+    if exists { n_touched = tile_counts[splat_ix]; }
+    let sum = gradient_of(lane, splat_ix, n_touched);
     var camera: CameraGradient;
-    if splat_ix < model.n_splats && atomicLoad(&status[FAILED]) == 0u { camera = update_splat(splat_ix); }
+    if exists { camera = update_splat(splat_ix, n_touched, sum); }
     add_up_camera(lane, block, camera);
 }
 
-// Sums the gradients of a splat's intersections in a fixed order.
-fn gradient_of(splat_ix: u32, n_touched: u32) -> Gradient {
+// Sums the gradients of a splat's intersections in a fixed order. Every lane must call it.
+fn gradient_of(lane: u32, splat_ix: u32, n_touched: u32) -> Gradient {
     var sum: Gradient;
-    let begin = slot_begins[splat_ix];
-    for (var slot = begin; slot < begin + n_touched; slot++) {
-        let part = gradients[slot];
-        sum.position += part.position;
-        sum.conic += part.conic;
-        sum.color += part.color;
+    if lane == 0u { atomicStore(&wg_n_large, 0u); }
+    workgroupBarrier(); // The number is zero.
+    var large_ix = 0xffffffffu;
+    if n_touched > MAX_SLOTS_PER_LANE {
+        large_ix = atomicAdd(&wg_n_large, 1u); // The order of large splats does not affect their sums.
+        wg_large[large_ix] = splat_ix;
+    } else if n_touched > 0u {
+        let begin = slot_begins[splat_ix];
+        for (var slot = begin; slot < begin + n_touched; slot++) {
+            sum.position += gradients[3u * slot];
+            sum.conic += gradients[3u * slot + 1u];
+            sum.color += gradients[3u * slot + 2u];
+        }
+    }
+    workgroupBarrier(); // All large splats are listed.
+    if lane == 0u { wg_n_large_read = atomicLoad(&wg_n_large); }
+    let n_large = workgroupUniformLoad(&wg_n_large_read);
+    for (var first = 0u; first < n_large; first += N_TEAMS) {
+        let large = first + lane / 32u;
+        var part = vec4f(0.0);
+        if large < n_large && lane % 32u < 3u * TEAM_ROWS {
+            let begin = slot_begins[wg_large[large]];
+            let n_rows = tile_counts[wg_large[large]];
+            for (var row = lane % 32u / 3u; row < n_rows; row += TEAM_ROWS) {
+                part += gradients[3u * (begin + row) + lane % 32u % 3u];
+            }
+        }
+        wg_parts[lane] = part;
+        workgroupBarrier(); // The teams have summed their rows.
+        if large_ix - first < N_TEAMS {
+            let at = (large_ix - first) * 32u;
+            for (var row = 0u; row < TEAM_ROWS; row++) {
+                sum.position += wg_parts[at + 3u * row];
+                sum.conic += wg_parts[at + 3u * row + 1u];
+                sum.color += wg_parts[at + 3u * row + 2u];
+            }
+        }
+        workgroupBarrier(); // The sums are read.
     }
     return sum;
 }
 
-fn update_splat(splat_ix: u32) -> CameraGradient {
+fn update_splat(splat_ix: u32, n_touched: u32, sum: Gradient) -> CameraGradient {
     var camera: CameraGradient;
-    let n_touched = tile_counts[splat_ix];
     if n_touched == 0u && rule.update_all == 0u && !GRADIENTS_ONLY { return camera; }
 
-    let sum = gradient_of(splat_ix, n_touched);
     let mean = means[splat_ix].xyz;
     let rotation = rotations[splat_ix];
     let shape = shapes[splat_ix];

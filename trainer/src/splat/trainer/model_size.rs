@@ -42,7 +42,7 @@ impl SplatTrainer {
                 let Self { recorder: Recorder { gpu, passes }, model, renderer, optimizer, views, .. } = &mut *self;
                 let context = StepContext { gpu, learn, renderer, model };
                 let view = optimizer.prepared_view(&context, passes, views.ready_level((view_ix, 0))?)?.view;
-                view.draw(passes, &renderer.pipelines);
+                view.draw_for_backward(passes, &renderer.pipelines, learn);
                 view.backward(passes, learn);
                 view.contribute(passes, learn, &contributions); // Has no effect if a buffer was too small.
                 passes.submit(gpu);

@@ -124,7 +124,7 @@ impl Optimizer {
             gains: &model.cameras.gains,
             ssim: self.has_ssim,
         };
-        view.draw(passes, &renderer.pipelines);
+        view.draw_for_backward(passes, &renderer.pipelines, learn);
         view.compare(passes, learn, &target);
         view.backward(passes, learn);
         if let Some(lens) = lens {

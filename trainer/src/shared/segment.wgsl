@@ -1,0 +1,22 @@
+// segment: a part of a tile's list, which one workgroup of `backward` processes.
+//
+// Lists differ in length by orders of magnitude, and a step would wait for the longest. `rasterize` divides them into
+// segments and stores the state of the tile's pixels at the beginning of each segment except the first.
+
+struct Segment {
+    tile: u32,
+    begin: u32,     // entries
+    end: u32,
+    unused: u32,
+}
+
+const SEGMENT_SPLATS = 128u;      // minimum length; a batch of `rasterize`
+const MAX_SEGMENTS = 16384u;      // lengths are multiples of the minimum, such that there are at most twice as many
+const N_STATE_PARTS = 5u;         // red, green, blue, depth, transmittance
+const STATE_PAIRS = 128u;         // pairs of pixels in a tile: 32 quarter + lane
+const HIDDEN_ENTRIES = 1024u;     // entries per piece of a list's hidden end
+
+// Length of segments in batches, if the view has this many intersections.
+fn batches_per_segment(n_slots: u32) -> u32 {
+    return max(n_slots / (SEGMENT_SPLATS * MAX_SEGMENTS), 1u);
+}
