@@ -9,8 +9,8 @@ use capture::{Change, Feed, FeedItem, InputResult};
 use keyframe::{Keyframe, Split};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
-use trainer::AlignTiming;
-use viz::{Hub, KeyframePose, ModelStatus, Status};
+use trainer::{AlignTiming, QueuedPicture};
+use viz::{Hub, KeyframePose, ModelStatus, PendingRender, Status};
 
 /// Period of status messages.
 const PUBLISH_PERIOD: Duration = Duration::from_millis(250);
@@ -20,6 +20,8 @@ const IDLE: Duration = Duration::from_millis(10);
 const SCORE_FRAC: f64 = 0.03;
 /// Polling period while waiting for a keyframe or a picture request.
 const POLL_PERIOD: Duration = Duration::from_millis(2);
+/// Maximum number of pictures in the GPU's queue.
+const MAX_QUEUED_PICTURES: usize = 8;
 /// Maximum time for which pictures are drawn before other work continues.
 const MAX_RENDER_TIME: Duration = Duration::from_millis(100);
 
@@ -71,6 +73,7 @@ pub struct Live {
 impl Live {
     /// Combines the parts. Training starts with the first call of [`Self::advance`].
     pub fn new(sessions: Vec<Session>, feed: Feed, hub: Hub, options: LiveOptions) -> Self {
+        let is_software = sessions.first().is_some_and(Session::is_software);
         Self {
             next_keyframe_at: vec![0; sessions.len()],
             sessions,
@@ -80,7 +83,7 @@ impl Live {
             start_keyframes: options.start_keyframes,
             keyframes: Vec::new(),
             n_evicted: 0,
-            budget: RenderBudget::default(),
+            budget: RenderBudget::new(is_software),
             next_refreshed: 0,
             published: None,
             scoring_time: Duration::ZERO,
@@ -296,36 +299,59 @@ impl Live {
     fn render(&mut self) -> crate::Result<()> {
         let started = Instant::now();
         if !self.is_training() || self.is_idle() {
-            self.budget = RenderBudget::default(); // Training is idle, so drawing does not delay it.
+            self.budget.refill(); // Training is idle, so drawing does not delay it.
         }
-        while started.elapsed() < MAX_RENDER_TIME && self.budget.may_render() {
-            let Some(pending) = self.hub.next_request() else { break };
+        while started.elapsed() < MAX_RENDER_TIME
+            && self.budget.may_render()
+            && self.hub.wait_for_request(Duration::ZERO)
+        {
+            // Work queued before the pictures counts as training time.
+            let before = Instant::now();
+            for session in &mut self.sessions {
+                session.n_total_steps()?;
+            }
+            self.budget.add_training(before.elapsed());
+            let before = Instant::now();
+            // The GPU draws the next pictures while the first ones are delivered.
+            let queued: Vec<_> = std::iter::from_fn(|| self.queue_picture()).take(MAX_QUEUED_PICTURES).collect();
+            for (pending, session_ix, queued) in queued {
+                self.deliver(pending, session_ix, queued);
+            }
+            self.budget.add_render(before.elapsed());
+        }
+        Ok(())
+    }
+
+    /// Starts to draw the next requested picture. Returns the request, the index of its session, and the picture.
+    /// Requests that cannot be drawn are answered.
+    fn queue_picture(&mut self) -> Option<(PendingRender, usize, Result<QueuedPicture, trainer::Error>)> {
+        loop {
+            let pending = self.hub.next_request()?;
             if self.keyframes.is_empty() {
                 pending.fail("no keyframe yet");
                 continue;
             }
-            let Some(session) = session_for_method(&mut self.sessions, pending.method()) else {
+            let Some(session_ix) = session_for_method(&self.sessions, pending.method()) else {
                 let available_methods =
                     self.sessions.iter().map(|session| session.kind().name()).collect::<Vec<_>>().join(" or ");
                 let requested = pending.method().unwrap_or_default().to_owned();
                 pending.fail(&format!("no model with the method {requested:?}; use {available_methods}"));
                 continue;
             };
-            // Work queued before the picture counts as training time.
-            let before = Instant::now();
-            session.n_total_steps()?;
-            self.budget.add_training(before.elapsed());
-            let before = Instant::now();
-            match session.render(&pending.request) {
-                Ok(picture) => {
-                    let n_keyframes = self.ledger.n_in_model(session.progress().step);
-                    pending.of_keyframes(n_keyframes as u64).deliver(picture);
-                }
-                Err(error) => pending.fail(&error.to_string()),
-            }
-            self.budget.add_render(before.elapsed());
+            let session = &mut self.sessions[session_ix];
+            let queued = session.queue_picture(&pending.request, pending.packing());
+            let n_keyframes = self.ledger.n_in_model(session.progress().step);
+            return Some((pending.of_keyframes(n_keyframes as u64), session_ix, queued));
         }
-        Ok(())
+    }
+
+    /// Waits for a picture and sends it to its client.
+    fn deliver(&mut self, pending: PendingRender, session_ix: usize, queued: Result<QueuedPicture, trainer::Error>) {
+        let session = &mut self.sessions[session_ix];
+        match queued.and_then(|queued| session.finish_picture(queued, &pending.request, pending.packing())) {
+            Ok(picture) => pending.deliver(picture),
+            Err(error) => pending.fail(&error.to_string()),
+        }
     }
 
     /// Publishes the status of the run to viewers, a few times per second.
@@ -454,9 +480,9 @@ pub struct LiveOptions {
     pub open_gpu: OpenGpu,
 }
 
-/// The session of a method; the first one if no method is given.
-fn session_for_method<'a>(sessions: &'a mut [Session], method: Option<&str>) -> Option<&'a mut Session> {
-    sessions.iter_mut().find(|session| method.is_none_or(|name| session.kind().name() == name))
+/// Index of the session of a method; of the first one if no method is given.
+fn session_for_method(sessions: &[Session], method: Option<&str>) -> Option<usize> {
+    sessions.iter().position(|session| method.is_none_or(|name| session.kind().name() == name))
 }
 
 fn model_status(session: &Session) -> ModelStatus {

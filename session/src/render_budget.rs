@@ -1,7 +1,8 @@
 //! Limits the share of time that is spent on drawing pictures during training.
 //!
-//! Each second of training adds one second of credit for pictures. Pictures are drawn immediately while credit is left.
-//! Training therefore keeps at least half of the time, unless a single picture takes longer than the maximum debt.
+//! Each second of training adds credit for pictures: a second on a software adapter, half a second on a GPU. Pictures
+//! are drawn immediately while credit is left. Training therefore keeps at least half or two thirds of the time, unless
+//! a single picture takes longer than the maximum debt.
 
 use std::time::Duration;
 
@@ -11,20 +12,30 @@ const MAX_CREDIT_SECS: f64 = 0.1;
 /// Maximum debt, seconds. After a picture that takes longer, training makes up for this time only.
 const MAX_DEBT_SECS: f64 = 1.0;
 
+/// Credit per second of training.
+const CREDIT_ON_SOFTWARE: f64 = 1.0;
+const CREDIT_ON_GPU: f64 = 0.5;
+
 /// The time available for pictures.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct RenderBudget {
     /// Credit if positive, debt if negative.
     balance_secs: f64,
-}
-
-impl Default for RenderBudget {
-    fn default() -> Self {
-        Self { balance_secs: MAX_CREDIT_SECS }
-    }
+    /// Credit per second of training.
+    rate: f64,
 }
 
 impl RenderBudget {
+    /// Full credit.
+    pub(crate) fn new(is_software: bool) -> Self {
+        Self { balance_secs: MAX_CREDIT_SECS, rate: if is_software { CREDIT_ON_SOFTWARE } else { CREDIT_ON_GPU } }
+    }
+
+    /// Restores the full credit.
+    pub(crate) fn refill(&mut self) {
+        self.balance_secs = self.balance_secs.max(MAX_CREDIT_SECS);
+    }
+
     /// Whether a picture may be drawn now.
     pub(crate) fn may_render(self) -> bool {
         self.balance_secs >= 0.0
@@ -32,7 +43,7 @@ impl RenderBudget {
 
     /// Adds time spent on training.
     pub(crate) fn add_training(&mut self, spent: Duration) {
-        let spent_secs = spent.as_secs_f64();
+        let spent_secs = self.rate * spent.as_secs_f64();
         self.balance_secs = (self.balance_secs + spent_secs).min(MAX_CREDIT_SECS.max(spent_secs));
     }
 
@@ -49,8 +60,8 @@ mod tests {
     const STEP: Duration = Duration::from_millis(4);
 
     /// Fraction of the time that pictures get if they are requested back to back.
-    fn render_frac(picture: Duration, step: Duration) -> f64 {
-        let (mut budget, mut rendered, mut trained) = (RenderBudget::default(), Duration::ZERO, Duration::ZERO);
+    fn render_frac(is_software: bool, picture: Duration, step: Duration) -> f64 {
+        let (mut budget, mut rendered, mut trained) = (RenderBudget::new(is_software), Duration::ZERO, Duration::ZERO);
         for _ in 0..10_000 {
             while budget.may_render() {
                 budget.add_render(picture);
@@ -63,18 +74,20 @@ mod tests {
     }
 
     #[test]
-    fn training_keeps_half_of_the_time() {
-        for millis in [1, 3, 40, 400] {
-            let frac = render_frac(Duration::from_millis(millis), STEP);
-            assert!((0.49..0.51).contains(&frac), "{millis} ms per picture: {frac}");
+    fn training_keeps_its_share_of_the_time() {
+        for (is_software, share) in [(true, 1.0 / 2.0), (false, 1.0 / 3.0)] {
+            for millis in [1, 3, 40, 400] {
+                let frac = render_frac(is_software, Duration::from_millis(millis), STEP);
+                assert!((frac - share).abs() < 0.01, "{millis} ms per picture: {frac}");
+            }
         }
         // On a CPU a picture may take so long that its debt is capped.
-        assert!(render_frac(Duration::from_secs(10), STEP) > 0.8);
+        assert!(render_frac(true, Duration::from_secs(10), STEP) > 0.8);
     }
 
     #[test]
     fn bursts_of_pictures_are_bounded() {
-        let mut budget = RenderBudget::default();
+        let mut budget = RenderBudget::new(true);
         let mut n_drawn = 0;
         while budget.may_render() {
             budget.add_render(Duration::from_millis(3));

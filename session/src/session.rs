@@ -31,7 +31,7 @@ use scoreboard::Scoreboard;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use trainer::gpu::Gpu;
-use trainer::{FailedModel, Method, ModelKind, Picture, Progress, RenderRequest};
+use trainer::{FailedModel, Method, ModelKind, Packing, Picture, Progress, QueuedPicture, RenderRequest, Rendered};
 use training_time::TrainingTime;
 
 /// Approximate duration of a slice. The device is idle for a moment at the end of each slice.
@@ -189,6 +189,33 @@ impl Session {
         self.method.render(request)
     }
 
+    /// Starts to render a picture, packed if `packing` is given; see [`Method::queue_packed`].
+    pub fn queue_picture(
+        &mut self,
+        request: &RenderRequest,
+        packing: Option<Packing>,
+    ) -> Result<QueuedPicture, trainer::Error> {
+        self.persistence.log_render();
+        match packing {
+            Some(packing) => self.method.queue_packed(request, packing),
+            None => self.method.render(request).map(|picture| QueuedPicture::ready(picture.into())),
+        }
+    }
+
+    /// Waits for the picture of a request.
+    pub fn finish_picture(
+        &mut self,
+        queued: QueuedPicture,
+        request: &RenderRequest,
+        packing: Option<Packing>,
+    ) -> Result<Rendered, trainer::Error> {
+        match (queued.finish(&self.gpu)?, packing) {
+            (Some(rendered), _) => Ok(rendered),
+            (None, Some(packing)) => self.method.render_packed(request, packing),
+            (None, None) => self.method.render(request).map(Rendered::Picture),
+        }
+    }
+
     /// Waits for queued work and returns the total number of updates, including those of trials.
     pub fn n_total_steps(&mut self) -> crate::Result<u64> {
         Ok(self.method.n_total_steps()?)
@@ -287,6 +314,11 @@ impl Session {
     /// Marks the session as finished at the current training time.
     pub fn mark_finished(&mut self) {
         self.time.mark_finished();
+    }
+
+    /// Whether the adapter runs on the CPU.
+    pub fn is_software(&self) -> bool {
+        self.gpu.is_software()
     }
 
     /// Returns an error if the GPU failed.

@@ -3,7 +3,7 @@
 use capture::Stop;
 use kinematics::Transform;
 use std::time::Duration;
-use trainer::{Aabb, Method, ModelKind, RenderRequest};
+use trainer::{Aabb, Method, ModelKind, RenderRequest, Rendered};
 use viz::{Hub, PendingRender};
 
 /// Maximum response time to Ctrl-C while no client requests a picture.
@@ -58,7 +58,11 @@ impl ModelViewer {
             let requested_method = requested_method.unwrap_or_default();
             return pending.fail(&format!("no model with the method {requested_method:?}; use {}", names.join(" or ")));
         };
-        match model.method.render(&request) {
+        let rendered = match pending.packing() {
+            Some(packing) => model.method.render_packed(&request, packing),
+            None => model.method.render(&request).map(Rendered::Picture),
+        };
+        match rendered {
             Ok(picture) => pending.deliver(picture),
             Err(error) => pending.fail(&error.to_string()),
         }

@@ -9,7 +9,7 @@ use crate::checkpoint::{Checkpoint, PendingCheckpoint};
 use crate::gpu::{Gpu, PassTiming};
 use crate::model_metadata::{METADATA_FILE, read_metadata};
 use crate::model_options::{AlignTiming, CommonOptions};
-use crate::{Bounds, Error, Method, Picture, Progress, RenderRequest};
+use crate::{Bounds, Error, Method, Packing, Picture, Progress, QueuedPicture, RenderRequest, Rendered};
 use calibration::TrialReport;
 use calibration::{Alignment, AlignmentTask, alignment_step};
 use calibration::{CalibratedCamera, CameraCorrection, CameraRefinement};
@@ -318,6 +318,14 @@ impl<M: Recalibrate + 'static> Method for Aligned<M> {
 
     fn render(&mut self, request: &RenderRequest) -> Result<Picture, Error> {
         self.model.render(request)
+    }
+
+    fn render_packed(&mut self, request: &RenderRequest, packing: Packing) -> Result<Rendered, Error> {
+        self.model.render_packed(request, packing)
+    }
+
+    fn queue_packed(&mut self, request: &RenderRequest, packing: Packing) -> Result<QueuedPicture, Error> {
+        self.model.queue_packed(request, packing)
     }
 
     fn set_watched(&mut self, watched: bool) {

@@ -29,6 +29,7 @@ mod model_options;
 mod model_spec;
 pub mod nerf;
 pub mod optim;
+mod packing;
 #[cfg(test)]
 mod random;
 mod registry;
@@ -54,5 +55,6 @@ pub use failed_model::FailedModel;
 pub use method::{Method, Progress};
 pub use model_options::{AlignTiming, CommonOptions, MethodOptions, ModelOptions};
 pub use model_spec::{LoadedModel, ModelSpec, Resumed, load, resume};
+pub use packing::{PackedDepth, PackedPicture, Packing, QueuedPicture, Rendered};
 pub use registry::ModelKind;
 pub use request::{Aabb, Picture, Projection, RenderRequest};

@@ -3,7 +3,7 @@
 use crate::bounds::Bounds;
 use crate::checkpoint::PendingCheckpoint;
 use crate::gpu::PassTiming;
-use crate::{Error, Picture, RenderRequest};
+use crate::{Error, Packing, Picture, QueuedPicture, RenderRequest, Rendered};
 use calibration::{Alignment, CalibratedCamera, TrialReport};
 use keyframe::Keyframe;
 use kinematics::Stamp;
@@ -26,7 +26,7 @@ pub struct Progress {
 /// Maximum GPU time of a training submit. Short enough that checkpoints, keyframes and Ctrl-C are handled soon.
 const SUBMIT_MILLIS: f64 = 20.0;
 /// Maximum while pictures are requested: each picture waits for the running submit and the queued submit.
-const SUBMIT_MILLIS_WATCHED: f64 = 4.0;
+const SUBMIT_MILLIS_WATCHED: f64 = 2.0;
 
 /// Maximum GPU time of a training submit, milliseconds.
 pub(crate) fn submit_millis(watched: bool) -> f64 {
@@ -63,6 +63,14 @@ pub trait Method {
     fn set_watched(&mut self, watched: bool);
     /// Renders a picture. If the model is empty, first initializes it as [`Method::seed`] does.
     fn render(&mut self, request: &RenderRequest) -> Result<Picture, Error>;
+    /// Renders a picture as [`Method::render`] does and packs it on the GPU, if the model and the adapter support it.
+    fn render_packed(&mut self, request: &RenderRequest, _packing: Packing) -> Result<Rendered, Error> {
+        self.render(request).map(Rendered::Picture)
+    }
+    /// Starts [`Method::render_packed`] without waiting for the GPU, if the model supports this.
+    fn queue_packed(&mut self, request: &RenderRequest, packing: Packing) -> Result<QueuedPicture, Error> {
+        self.render_packed(request, packing).map(QueuedPicture::ready)
+    }
     /// PSNR of the requested picture against a keyframe's image of the same size, dB, computed on the GPU.
     /// Bit-identical to [`crate::eval::psnr`] of the 8-bit picture. `None` if the model does not support this, or not
     /// yet.

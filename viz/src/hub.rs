@@ -1,5 +1,6 @@
 //! Shared state of the training thread and the server. The training thread never waits for a client.
 
+use crate::picture::packing;
 use crate::pose::row_major;
 use crate::protocol::{PictureHeader, ProjectionMessage};
 use crate::queue::{Outgoing, Queue, RenderJob};
@@ -10,7 +11,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use tokio::sync::{Notify, watch};
-use trainer::{Picture, Projection, RenderRequest};
+use trainer::{Packing, Projection, RenderRequest, Rendered};
 
 /// Handle shared by the training thread and a [`Server`](crate::Server). Clones refer to the same hub.
 #[derive(Clone, Debug, Default)]
@@ -181,9 +182,15 @@ impl PendingRender {
         self
     }
 
+    /// How the client receives this stage; `None` if that cannot be packed on the GPU.
+    pub fn packing(&self) -> Option<Packing> {
+        packing(&self.job.view_request, self.job.stage + 1 == self.job.view_request.stages.len())
+    }
+
     /// Sends the rendered picture to the client. Encoding happens on the server's threads.
-    pub fn deliver(mut self, picture: Picture) {
-        let header = self.header(&picture);
+    pub fn deliver(mut self, picture: impl Into<Rendered>) {
+        let picture = picture.into();
+        let header = self.header(picture.size_px());
         if header.last {
             self.hub.queue().record_render_time(&self.job, header.render_millis);
         }
@@ -200,7 +207,7 @@ impl PendingRender {
         self.hub.queue().push_outgoing(self.job.client, outgoing);
     }
 
-    fn header(&self, picture: &Picture) -> PictureHeader {
+    fn header(&self, size_px: [u32; 2]) -> PictureHeader {
         let view_request = &self.job.view_request;
         PictureHeader {
             id: view_request.id,
@@ -208,7 +215,7 @@ impl PendingRender {
             n_stages: view_request.stages.len(),
             scale: view_request.stages[self.job.stage],
             last: self.job.stage + 1 == view_request.stages.len(),
-            size_px: picture.size_px,
+            size_px,
             full_size_px: view_request.request.size_px,
             world_from_camera: row_major(&view_request.request.world_from_camera),
             projection: projection_message(&view_request.request.projection),

@@ -6,7 +6,7 @@ use crate::protocol::{BinaryHeader, ColorPart, DepthFormat, DepthPart, LiveHeade
 use crate::updates::{LiveImage, LivePixels};
 use crate::view_request::ViewRequest;
 use std::time::Instant;
-use trainer::Picture;
+use trainer::{PackedDepth, Packing, Picture, Rendered};
 
 /// JPEG quality of the last stage. It gives no visible blocks on textures.
 const QUALITY_LAST: u8 = 92;
@@ -32,36 +32,55 @@ pub(crate) enum PackError {
     SizeMismatch { got: [u32; 2], expected: [u32; 2] },
 }
 
+/// How a stage is packed on the GPU; `None` if the client requests another format.
+pub(crate) fn packing(view_request: &ViewRequest, is_last: bool) -> Option<Packing> {
+    let quality = if is_last { QUALITY_LAST } else { QUALITY_INTERMEDIATE };
+    let packing = Packing { jpeg_quality: view_request.color.then_some(quality), depth: view_request.depth.is_some() };
+    (view_request.depth != Some(DepthFormat::F32)).then_some(packing)
+}
+
 /// The binary message of one rendered stage.
 pub(crate) fn pack_picture(
     view_request: &ViewRequest,
     mut header: PictureHeader,
-    picture: &Picture,
+    rendered: &Rendered,
 ) -> Result<Vec<u8>, PackError> {
     let began = Instant::now();
+    let encoded;
+    let (color, depth) = match rendered {
+        Rendered::Packed(packed) => (packed.jpeg.as_deref(), packed.depth.as_ref()),
+        Rendered::Picture(picture) => {
+            encoded = encode_picture(view_request, header.last, picture)?;
+            (encoded.0.as_deref(), encoded.1.as_ref())
+        }
+    };
+    let offset = color.map_or(0, <[u8]>::len);
+    header.color = color.map(|color| ColorPart { format: "jpeg", offset: 0, bytes: color.len() });
+    header.depth = depth.zip(view_request.depth).map(|(packed, format)| DepthPart {
+        format,
+        size_px: packed.size_px,
+        meters_per_count: packed.meters_per_count,
+        offset,
+        bytes: packed.counts.len(),
+    });
+    header.encode_millis = Some(began.elapsed().as_secs_f64() * 1e3);
+    let depth_bytes = depth.map_or(&[][..], |packed| &packed.counts);
+    Ok(frame(&BinaryHeader::Picture(&header), &[color.unwrap_or_default(), depth_bytes]))
+}
+
+/// Encodes the requested color and depth of a picture.
+fn encode_picture(
+    view_request: &ViewRequest,
+    is_last: bool,
+    picture: &Picture,
+) -> Result<(Option<Vec<u8>>, Option<PackedDepth>), PackError> {
     let (color, depth) = std::thread::scope(|scope| {
         // Color and depth in parallel: color takes most of the time and runs on this thread.
         let depth = view_request.depth.map(|format| scope.spawn(move || pack_depth(format, picture)));
-        let color = view_request.color.then(|| pack_color(picture, header.last));
+        let color = view_request.color.then(|| pack_color(picture, is_last));
         (color, depth.map(|task| task.join().expect("packing depth does not panic")))
     });
-    let color = color.transpose()?.unwrap_or_default();
-    if view_request.color {
-        header.color = Some(ColorPart { format: "jpeg", offset: 0, bytes: color.len() });
-    }
-    let mut depth_bytes = Vec::new();
-    if let (Some(packed), Some(format)) = (depth.transpose()?, view_request.depth) {
-        depth_bytes = packed.bytes;
-        header.depth = Some(DepthPart {
-            format,
-            size_px: packed.size_px,
-            meters_per_count: packed.meters_per_count,
-            offset: color.len(),
-            bytes: depth_bytes.len(),
-        });
-    }
-    header.encode_millis = Some(began.elapsed().as_secs_f64() * 1e3);
-    Ok(frame(&BinaryHeader::Picture(&header), &[&color, &depth_bytes]))
+    Ok((color.transpose()?, depth.transpose()?))
 }
 
 fn pack_color(picture: &Picture, is_last: bool) -> Result<Vec<u8>, JpegError> {
@@ -102,13 +121,6 @@ fn live_message(image: &LiveImage, size_px: [u32; 2], factor: u32, jpeg: &[u8], 
     frame(&BinaryHeader::LiveImage(&LiveHeader::new(image, size_px, factor, clock)), &[jpeg])
 }
 
-/// Depth as encoded in a message.
-struct PackedDepth {
-    size_px: [u32; 2],
-    meters_per_count: f64,
-    bytes: Vec<u8>,
-}
-
 fn pack_depth(format: DepthFormat, picture: &Picture) -> Result<PackedDepth, PackError> {
     let [width, height] = picture.size_px;
     let needed = width as usize * height as usize;
@@ -127,7 +139,7 @@ fn f32_depth(picture: &Picture) -> PackedDepth {
     for (packed, depth) in bytes.chunks_exact_mut(4).zip(&picture.depth_m) {
         packed.copy_from_slice(&depth.to_le_bytes());
     }
-    PackedDepth { size_px: picture.size_px, meters_per_count: 1.0, bytes }
+    PackedDepth { size_px: picture.size_px, meters_per_count: 1.0, counts: bytes }
 }
 
 /// Halves the size of a depth map. Each block of 2x2 pixels keeps its nearest depth, so that thin objects in front stay
@@ -159,7 +171,7 @@ fn half_depth(picture: &Picture, n_threads: usize) -> PackedDepth {
             });
         }
     });
-    PackedDepth { size_px, meters_per_count, bytes }
+    PackedDepth { size_px, meters_per_count, counts: bytes }
 }
 
 /// Depth of a pixel, or infinity if it has none.
@@ -192,12 +204,12 @@ fn write_counts(depth_m: &[f32], counts_per_meter: f64, packed: &mut [u8]) {
 
 #[cfg(test)]
 mod tests {
-    use super::{PackedDepth, half_depth, pack_live_image};
+    use super::{half_depth, pack_live_image};
     use crate::clock::ServerClock;
     use crate::updates::{LiveImage, LivePixels};
     use kinematics::Stamp;
     use std::time::Instant;
-    use trainer::Picture;
+    use trainer::{PackedDepth, Picture};
 
     #[test]
     fn half_depth_keeps_nearest_and_holes() {
@@ -226,7 +238,7 @@ mod tests {
 
     fn check_halved(packed: &PackedDepth) {
         assert_eq!(packed.size_px, [3, 2]);
-        let counts = packed.bytes.chunks_exact(2).map(|count| u16::from_le_bytes([count[0], count[1]]));
+        let counts = packed.counts.chunks_exact(2).map(|count| u16::from_le_bytes([count[0], count[1]]));
         let meters: Vec<f64> = counts.map(|count| f64::from(count) * packed.meters_per_count).collect();
         for (got, expected) in meters.iter().zip([0.5, 0.0, 4.0, 2.5, 8.0, 10.0]) {
             assert!((got - expected).abs() <= 0.5 * packed.meters_per_count + 1e-9, "{meters:?}");
@@ -236,7 +248,7 @@ mod tests {
     #[test]
     fn empty_picture_has_zero_depth() {
         let packed = half_depth(&Picture { size_px: [2, 2], rgba_srgb: vec![0; 16], depth_m: vec![0.0; 4] }, 1);
-        assert_eq!(packed.bytes, [0, 0]);
+        assert_eq!(packed.counts, [0, 0]);
     }
 
     #[test]
@@ -308,7 +320,7 @@ mod tests {
                 let (bytes, millis) = best(&|| crate::jpeg::encode(&pixels, quality, chroma).expect("encoded").len());
                 println!("{size_px:?} color {name}: {millis:.2} ms, {bytes} bytes");
             }
-            let (bytes, millis) = best(&|| half_depth(&picture, crate::jpeg::n_threads()).bytes.len());
+            let (bytes, millis) = best(&|| half_depth(&picture, crate::jpeg::n_threads()).counts.len());
             println!("{size_px:?} depth u16_half: {millis:.2} ms, {bytes} bytes");
             let (bytes, millis) = best(&|| {
                 let rgb: Vec<u8> =

@@ -5,7 +5,7 @@ use crate::view_request::ViewRequest;
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 use tokio::sync::Notify;
-use trainer::Picture;
+use trainer::Rendered;
 
 /// Maximum number of pictures per client that are being rendered or sent. It limits rendering for slow clients.
 const MAX_UNSENT: usize = 2;
@@ -55,7 +55,7 @@ pub(crate) struct RenderJob {
 #[derive(Debug)]
 pub(crate) enum Outgoing {
     /// A rendered stage that is not encoded yet. The header does not yet describe the parts of the payload.
-    Picture(Box<(RenderJob, PictureHeader, Picture)>),
+    Picture(Box<(RenderJob, PictureHeader, Rendered)>),
     /// A stage that could not be rendered.
     Failed { id: u64, reason: String },
 }

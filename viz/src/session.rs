@@ -275,7 +275,7 @@ impl Writer<'_> {
 /// An encoded picture, or the reason why there is none.
 type EncodingResult = Result<Result<Vec<u8>, PackError>, JoinError>;
 
-fn pack(rendered: Box<(crate::queue::RenderJob, crate::protocol::PictureHeader, trainer::Picture)>) -> EncodingTask {
+fn pack(rendered: Box<(crate::queue::RenderJob, crate::protocol::PictureHeader, trainer::Rendered)>) -> EncodingTask {
     let id = rendered.0.view_request.id;
     let task = tokio::task::spawn_blocking(move || {
         let (job, header, picture) = *rendered;

@@ -14,8 +14,9 @@ use super::reference::march as reference;
 use super::sizes::{MAX_LEVELS, MIN_LEVELS, Sizes};
 use crate::gpu::{Buffer, Gpu, PassTiming, Passes, PendingRead, f32_of};
 use crate::model_options::ModelOptions;
+use crate::packing::{LazyPacker, Output};
 use crate::view::Camera;
-use crate::{Error, Picture};
+use crate::{Error, Rendered};
 use calibration::{EMBEDDING_DIM, ParamSet};
 use kinematics::random::{hash, unit_from_bits};
 use rayon::prelude::*;
@@ -76,6 +77,7 @@ pub(crate) struct FieldTrainer {
     slots: Vec<RaySlot>,
     rules: [Buffer; 2],
     picture: Option<(RaySlot, SampleBuffers, Canvas)>,
+    packer: LazyPacker,
     passes: Passes,
 }
 
@@ -125,6 +127,7 @@ impl FieldTrainer {
                 gpu.uniform_with("nerf.weight_rule", &rule(options, 1e-6)),
             ],
             picture: None,
+            packer: LazyPacker::default(),
             passes: Passes::default(),
             field,
             gradients,
@@ -452,8 +455,8 @@ impl FieldTrainer {
         background_srgb: [f32; 3],
         radius_m: f64,
         embedding: [f64; EMBEDDING_DIM],
-        depth: bool,
-    ) -> Result<Picture, Error> {
+        output: Output,
+    ) -> Result<Rendered, Error> {
         let n_pixels = camera.size_px[0] as usize * camera.size_px[1] as usize;
         self.make_canvas(gpu, n_pixels as u64)?;
         let Some((slot, samples, canvas)) = &self.picture else { return Err(Error::DeviceLost) };
@@ -461,7 +464,7 @@ impl FieldTrainer {
         let backdrop = Backdrop { srgb: background_srgb, radius_m: f32_of(radius_m) };
         gpu.write(&canvas.backdrop, 0, bytemuck::bytes_of(&backdrop));
         gpu.write(&canvas.image_params, 0, bytemuck::cast_slice(&image_params_of(&[embedding])));
-        let Self { compiled, field, occupancy, passes: list, sizes, .. } = self;
+        let Self { compiled, field, occupancy, passes: list, sizes, packer, .. } = self;
         let image_params = &canvas.image_params;
         let picture_passes = FieldPasses { gpu, pipelines: &compiled.pipelines, field, samples, slot, image_params };
         picture_passes.convert_weights(list);
@@ -483,9 +486,7 @@ impl FieldTrainer {
                 }
             }
         }
-        let buffers_to_read = Picture::buffers(camera.size_px, &canvas.pixels, depth.then_some(&canvas.depths));
-        let read = list.submit_reading(gpu, &buffers_to_read);
-        read.finish_with(gpu, |parts| Picture::from_parts(camera.size_px, parts))
+        packer.read(gpu, list, output, camera.size_px, [&canvas.pixels, &canvas.depths])
     }
 
     fn make_canvas(&mut self, gpu: &Gpu, n_pixels: u64) -> Result<(), Error> {

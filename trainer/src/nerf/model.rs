@@ -12,9 +12,12 @@ use super::sizes::Sizes;
 use crate::checkpoint::PendingCheckpoint;
 use crate::gpu::{Gpu, PassTiming};
 use crate::model_options::ModelOptions;
+use crate::packing::Output;
 use crate::submits::Submits;
-use crate::view::{Camera, projections};
-use crate::{Bounds, CorrectedKeyframe, Error, Method, Picture, Progress, Recalibrate, RenderRequest};
+use crate::view::Camera;
+use crate::{
+    Bounds, CorrectedKeyframe, Error, Method, Packing, Picture, Progress, Recalibrate, RenderRequest, Rendered,
+};
 use calibration::Alignment;
 use calibration::TrialReport;
 use calibration::{CalibratedCamera, CameraCorrection, EMBEDDING_DIM, ParamSet};
@@ -232,10 +235,11 @@ impl NerfModel {
         request: &RenderRequest,
         camera: &Camera,
         embedding: [f64; EMBEDDING_DIM],
-    ) -> Result<Picture, Error> {
-        let RenderRequest { background_srgb, depth, .. } = *request;
+        output: Output,
+    ) -> Result<Rendered, Error> {
+        let background_srgb = request.background_srgb;
         let Some((extent, field_trainer)) = &mut self.field else {
-            return Ok(Picture::empty(camera.size_px, background_srgb, depth));
+            return Ok(Rendered::empty(camera.size_px, background_srgb, output));
         };
         field_trainer.draw(
             &self.gpu,
@@ -243,7 +247,7 @@ impl NerfModel {
             background_srgb,
             extent.radius_m,
             embedding,
-            depth,
+            output,
         )
     }
 }
@@ -347,7 +351,13 @@ impl Method for NerfModel {
         // Rendering must not create a field: the times of pictures would then determine its initial keyframes.
         self.finish_in_flight()?;
         let embedding = self.embedding_of(request.appearance_of.as_ref())?;
-        projections::render(request, |camera| self.draw(request, camera, embedding))
+        Rendered::picture(request, |camera, output| self.draw(request, camera, embedding, output))
+    }
+
+    fn render_packed(&mut self, request: &RenderRequest, packing: Packing) -> Result<Rendered, Error> {
+        self.finish_in_flight()?;
+        let embedding = self.embedding_of(request.appearance_of.as_ref())?;
+        Rendered::of(request, packing, |camera, output| self.draw(request, camera, embedding, output))
     }
 
     fn set_watched(&mut self, watched: bool) {

@@ -271,7 +271,8 @@ impl Scratch {
         let per_bin = |name: &str, n: u32| gpu.storage(name, 4 * u64::from(n_bins) * u64::from(n.max(1)));
         Ok(Self {
             n_entries,
-            capacity: gpu.uniform_with("splat.capacity", &Capacity { n_entries, n_slots, n_segments: n_segments[0], unused: 0 }),
+            capacity: gpu
+                .uniform_with("splat.capacity", &Capacity { n_entries, n_slots, n_segments: n_segments[0], unused: 0 }),
             projected_splats: gpu.storage("splat.projected_splats", 48 * u64::from(n_splats))?,
             tile_counts: words("splat.tile_counts", n_splats)?,
             touched: gpu.storage("splat.touched", 12 * u64::from(n_splats))?,

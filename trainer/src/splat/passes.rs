@@ -214,7 +214,16 @@ impl ViewPasses<'_> {
         passes.dispatch(gpu, &pipelines.sum_bins, n_groups * n_windows, &[view, model, bin_counts, group_counts]);
         let scanned = [view, model, group_counts, bin_totals];
         passes.dispatch(gpu, &pipelines.scan_bins, u64::from(n_bins(size_px)), &scanned);
-        let allocated = [view, model, ("capacity", &scratch.capacity), bin_totals, bin_starts, block_slots, status, ("segment_counts", &scratch.segment_counts)];
+        let allocated = [
+            view,
+            model,
+            ("capacity", &scratch.capacity),
+            bin_totals,
+            bin_starts,
+            block_slots,
+            status,
+            ("segment_counts", &scratch.segment_counts),
+        ];
         passes.dispatch(gpu, &pipelines.allocate, 1, &allocated);
         let entries = ("entries", &scratch.entries);
         let emitted = [

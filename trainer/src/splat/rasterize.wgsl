@@ -67,11 +67,20 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
             for (var part = 0u; part < BATCH / 32u; part++) {
                 var bits = atomicLoad(&wg_reaching[quarter * 4u + part]);
                 while bits != 0u && any(blend.live) {
-                    let splat = wg_splats[32u * part + firstTrailingBit(bits)];
+                    // Two at once, so that their latencies overlap.
+                    let i = 32u * part + firstTrailingBit(bits);
                     bits &= bits - 1u;
+                    let has_second = bits != 0u;
+                    let j = select(i, 32u * part + firstTrailingBit(bits), has_second);
+                    bits &= bits - 1u;
+                    let splat = wg_splats[i];
+                    let second = wg_splats[j];
                     let power = power_at(splat.conic, splat.position.x - center_x, splat.position.y - center_y);
+                    let power_2 = power_at(second.conic, second.position.x - center_x, second.position.y - center_y);
                     let hit = blend.live & within_reach(splat.conic, power);
                     blend = blended(blend, hit, power, splat.position.wz, splat.color.rgb, bitcast<u32>(splat.color.w));
+                    let hit_2 = PxB(has_second) & blend.live & within_reach(second.conic, power_2);
+                    blend = blended(blend, hit_2, power_2, second.position.wz, second.color.rgb, bitcast<u32>(second.color.w));
                 }
             }
             if !counted && !any(blend.live) {

@@ -16,6 +16,7 @@ mod scoring;
 mod seeding;
 mod training;
 mod view_set;
+mod work_counts;
 
 use super::arrays::SplatArrays;
 use super::bounds::bounds;
@@ -33,8 +34,8 @@ use crate::checkpoint::PendingCheckpoint;
 use crate::gpu::{Gpu, PassTiming};
 use crate::model_metadata::{METADATA_FILE, read_metadata};
 use crate::model_options::{MethodOptions, ModelOptions};
-use crate::view::projections;
-use crate::{Bounds, Error, Method, Picture, Progress, Projection, RenderRequest};
+use crate::packing::Output;
+use crate::{Bounds, Error, Method, Packing, Picture, Progress, Projection, QueuedPicture, RenderRequest, Rendered};
 use calibration::{Alignment, CalibratedCamera, CameraCorrection, Trial, TrialReport};
 use keyframe::{Keyframe, Split};
 use kinematics::Stamp;
@@ -195,9 +196,21 @@ impl SplatTrainer {
     }
 
     /// Draws one pinhole view of the displayed splats.
-    fn draw_view(&mut self, camera: &Camera, background_srgb: [f32; 3], depth: bool) -> Result<Picture, Error> {
+    fn draw_view(&mut self, camera: &Camera, background_srgb: [f32; 3], output: Output) -> Result<Rendered, Error> {
         let drawn = DrawnView { splats: self.trials.displayed(&self.model.splats), camera, background_srgb };
-        self.renderer.picture(&mut self.recorder, drawn, depth)
+        self.renderer.picture(&mut self.recorder, drawn, output)
+    }
+
+    /// Starts to draw and pack a view, on any adapter.
+    pub(super) fn queue_view(
+        &mut self,
+        camera: &Camera,
+        background_srgb: [f32; 3],
+        packing: Packing,
+    ) -> Result<QueuedPicture, Error> {
+        self.seed_from_depth()?;
+        let drawn = DrawnView { splats: self.trials.displayed(&self.model.splats), camera, background_srgb };
+        self.renderer.queue(&mut self.recorder, drawn, packing)
     }
 }
 
@@ -263,7 +276,23 @@ impl Method for SplatTrainer {
 
     fn render(&mut self, request: &RenderRequest) -> Result<Picture, Error> {
         self.seed_from_depth()?;
-        projections::render(request, |camera| self.draw_view(camera, request.background_srgb, request.depth))
+        Rendered::picture(request, |camera, output| self.draw_view(camera, request.background_srgb, output))
+    }
+
+    fn render_packed(&mut self, request: &RenderRequest, packing: Packing) -> Result<Rendered, Error> {
+        self.seed_from_depth()?;
+        Rendered::of(request, packing, |camera, output| self.draw_view(camera, request.background_srgb, output))
+    }
+
+    fn queue_packed(&mut self, request: &RenderRequest, packing: Packing) -> Result<QueuedPicture, Error> {
+        let Projection::Pinhole { focal_px, principal_px } = request.projection else {
+            return self.render_packed(request, packing).map(QueuedPicture::ready);
+        };
+        if self.recorder.gpu.is_software() {
+            return self.render_packed(request, packing).map(QueuedPicture::ready);
+        }
+        let camera = Camera::from_request(request, focal_px, principal_px);
+        self.queue_view(&camera, request.background_srgb, packing)
     }
 
     fn set_watched(&mut self, watched: bool) {

@@ -6,7 +6,8 @@ use super::{SplatOptions, SplatTrainer};
 use crate::eval::{PixelPair, psnr};
 use crate::gpu::{Gpu, GpuOptions, f32s_of};
 use crate::model_options::{CommonOptions, ModelOptions};
-use crate::{Method, Projection, RenderRequest};
+use crate::view::Camera;
+use crate::{Method, Packing, Projection, RenderRequest, Rendered};
 use calibration::{CameraRefinement, ParamSet};
 use keyframe::{DepthMap, Keyframe, Split};
 use kinematics::{Stamp, Transform};
@@ -509,4 +510,41 @@ fn buffer_overflow_does_not_change_the_result() {
     assert_eq!((one_by_one.0, one_by_one.1), (N_STEPS, N_STEPS));
     assert_eq!((together.0, together.1), (N_STEPS, N_STEPS));
     assert!(one_by_one.2 == together.2);
+}
+
+/// Pictures are queued before any of them is read. The first ones do not fit into the buffers.
+#[test]
+fn queued_pictures_equal_rendered_ones() {
+    const MAX_MEAN_DIFFERENCE: f64 = 1.0; // Of JPEG at quality 95, in 255ths.
+    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let mut cloud = synthetic_cloud(2000, 5);
+    cloud.log_scales.fill([1.5; 3]); // Every splat covers every image, which overflows the buffers.
+    let packing = Packing { jpeg_quality: Some(95), depth: true };
+    let projection = Projection::Pinhole { focal_px: [4.0 * FOCAL_PX; 2], principal_px: [192.0, 160.0] };
+    let requests =
+        [0, 3].map(|ix| RenderRequest { size_px: SIZE_PX.map(|px| 4 * px), projection, ..request(pose(ix)) });
+    let mut trainer = SplatTrainer::from_arrays(gpu.clone(), options(), &cloud).unwrap();
+    let queue = |trainer: &mut SplatTrainer| {
+        requests.clone().map(|request| {
+            let Projection::Pinhole { focal_px, principal_px } = request.projection else { unreachable!() };
+            let camera = Camera::from_request(&request, focal_px, principal_px);
+            trainer.queue_view(&camera, request.background_srgb, packing).unwrap()
+        })
+    };
+    for queued in queue(&mut trainer) {
+        assert!(queued.finish(&gpu).unwrap().is_none(), "the buffers must be too small");
+    }
+    let rendered = requests.clone().map(|request| trainer.render(&request).unwrap());
+    for (queued, rendered) in queue(&mut trainer).into_iter().zip(rendered) {
+        let Some(Rendered::Packed(packed)) = queued.finish(&gpu).unwrap() else { panic!("the picture is not packed") };
+        let decoded = image::load_from_memory(&packed.jpeg.unwrap()).unwrap().to_rgb8();
+        let pixels = rendered.rgba_srgb.chunks_exact(4).flat_map(|pixel| &pixel[..3]);
+        let sum: f64 = decoded.as_raw().iter().zip(pixels).map(|(a, b)| f64::from(a.abs_diff(*b))).sum();
+        let mean = sum / decoded.as_raw().len() as f64;
+        assert!(mean < MAX_MEAN_DIFFERENCE, "colors differ by {mean} on average");
+        let depth = packed.depth.unwrap();
+        let furthest_m = rendered.depth_m.iter().copied().fold(0.0, f32::max);
+        assert!((depth.meters_per_count * 65535.0 / f64::from(furthest_m) - 1.0).abs() < 0.1);
+        assert_eq!(depth.counts.len(), 2 * 192 * 160);
+    }
 }

@@ -22,8 +22,8 @@ use crate::Bounds;
 use crate::checkpoint::PendingCheckpoint;
 use crate::gpu::{Gpu, PassTiming, Passes};
 use crate::model_options::ModelOptions;
-use crate::view::projections;
-use crate::{CorrectedKeyframe, Error, Method, Picture, Progress, Recalibrate, RenderRequest};
+use crate::packing::LazyPacker;
+use crate::{CorrectedKeyframe, Error, Method, Packing, Picture, Progress, Recalibrate, RenderRequest, Rendered};
 use calibration::Alignment;
 use calibration::CalibratedCamera;
 use calibration::TrialReport;
@@ -59,6 +59,7 @@ pub struct TsdfModel {
     store: Option<FieldStore>,
     fusion: Fusion,
     canvas: Option<Canvas>,
+    packer: LazyPacker,
     meshing: Meshing,
 }
 
@@ -82,6 +83,7 @@ impl TsdfModel {
             store: None,
             fusion: Fusion::new(),
             canvas: None,
+            packer: LazyPacker::default(),
             meshing: Meshing::default(),
             gpu,
             options,
@@ -335,7 +337,13 @@ impl Method for TsdfModel {
     fn render(&mut self, request: &RenderRequest) -> Result<Picture, Error> {
         self.finish_in_flight()?;
         self.fuse_one()?;
-        projections::render(request, |camera| self.draw_view(camera, request.background_srgb, request.depth))
+        Rendered::picture(request, |camera, output| self.draw_view(camera, request.background_srgb, output))
+    }
+
+    fn render_packed(&mut self, request: &RenderRequest, packing: Packing) -> Result<Rendered, Error> {
+        self.finish_in_flight()?;
+        self.fuse_one()?;
+        Rendered::of(request, packing, |camera, output| self.draw_view(camera, request.background_srgb, output))
     }
 
     fn set_watched(&mut self, watched: bool) {

@@ -96,6 +96,11 @@ impl Optimizer {
         renderer::clear_failure(gpu, &self.status);
     }
 
+    /// One past the last splat that contributes to each pixel, counted from the start of the bin's list.
+    pub(super) fn last_contributors(&self) -> Result<&Buffer, Error> {
+        self.image_buffers.as_ref().map(|buffers| &buffers.last).ok_or(Error::DeviceLost)
+    }
+
     /// Allocates the buffers for training up to `capacity` splats on images of this size.
     pub(super) fn reserve_view(
         &mut self,

@@ -2,12 +2,13 @@
 
 use super::products::{self, Products};
 use super::recorder::Recorder;
-use crate::gpu::{Buffer, Gpu, Pipeline};
+use crate::gpu::{Buffer, Gpu, PendingRead, Pipeline};
+use crate::packing::{self, LazyPacker, Output};
 use crate::splat::buffers::{ImageBuffers, Scratch, ScratchSize, SplatBuffers, n_bins, n_tiles};
 use crate::splat::kernels::DrawPipelines;
 use crate::splat::params::{Camera, Supervision, View, status};
 use crate::splat::passes::ViewPasses;
-use crate::{Error, Picture};
+use crate::{Error, Packing, Picture, QueuedPicture, Rendered};
 
 /// Minimum capacity of the bin lists, in entries.
 const MIN_ENTRIES: u32 = 1 << 14;
@@ -23,6 +24,7 @@ pub(super) struct Renderer {
     background: Buffer,
     /// Buffer for images uploaded for comparison, kept for reuse.
     compared: Option<Buffer>,
+    packer: LazyPacker,
 }
 
 /// A view to draw.
@@ -36,9 +38,7 @@ pub(super) struct DrawnView<'a> {
 /// Results to read back after drawing.
 #[derive(Clone, Copy, Debug)]
 enum ReadParts<'a> {
-    Picture {
-        depth: bool,
-    },
+    Picture(Output),
     /// The sums of `score.wgsl` for a comparison with an image.
     Comparison {
         score: &'a Pipeline,
@@ -56,6 +56,7 @@ impl Renderer {
             view: gpu.uniform_with("splat.draw_view", &<View as bytemuck::Zeroable>::zeroed()),
             background: gpu.uniform_with("splat.background", &<Supervision as bytemuck::Zeroable>::zeroed()),
             compared: None,
+            packer: LazyPacker::default(),
         })
     }
 
@@ -64,10 +65,20 @@ impl Renderer {
         &mut self,
         recorder: &mut Recorder,
         drawn: DrawnView<'_>,
-        depth: bool,
-    ) -> Result<Picture, Error> {
-        let size_px = drawn.camera.size_px;
-        self.draw(recorder, drawn, ReadParts::Picture { depth }, |parts| Picture::from_parts(size_px, parts))
+        output: Output,
+    ) -> Result<Rendered, Error> {
+        let (size_px, output) = (drawn.camera.size_px, output.on(&recorder.gpu));
+        let take = |parts: &[&[u8]]| match output {
+            Output::Picture { .. } => Some(Rendered::Picture(Picture::from_parts(size_px, parts))),
+            Output::Packed(packing) => packing::unpack(packing, size_px, parts).map(Rendered::Packed),
+        };
+        match (self.draw(recorder, drawn, ReadParts::Picture(output), take)?, output, &self.image_buffers) {
+            (None, Output::Packed(Packing { depth, .. }), Some(ImageBuffers { pixels, depths, .. })) => {
+                let Recorder { gpu, passes } = recorder;
+                packing::read_picture(gpu, passes, size_px, [pixels, depths], depth).map(Rendered::Picture)
+            }
+            (rendered, ..) => rendered.ok_or(Error::DeviceLost),
+        }
     }
 
     /// Draws a picture and compares it with an image of the same size.
@@ -105,44 +116,30 @@ impl Renderer {
         Ok(products)
     }
 
+    /// Starts to draw and pack a picture.
+    pub(super) fn queue(
+        &mut self,
+        recorder: &mut Recorder,
+        drawn: DrawnView<'_>,
+        packing: Packing,
+    ) -> Result<QueuedPicture, Error> {
+        let read = self.submit(recorder, drawn, ReadParts::Picture(Output::Packed(packing)))?;
+        Ok(QueuedPicture::packed(read, is_complete, packing, drawn.camera.size_px))
+    }
+
     /// Draws a view and passes the bytes of the requested parts to `take`. If a buffer was too small, grows it and
     /// draws again.
     fn draw<R>(
         &mut self,
         recorder: &mut Recorder,
-        DrawnView { splats, camera, background_srgb: [red, green, blue] }: DrawnView<'_>,
+        drawn: DrawnView<'_>,
         parts: ReadParts<'_>,
         take: impl Fn(&[&[u8]]) -> R,
     ) -> Result<R, Error> {
-        let size_px = camera.size_px;
-        recorder.gpu.write(&self.view, 0, bytemuck::bytes_of(&camera.view()));
-        let background = Supervision { background_srgb: [red, green, blue, 0.0], ..bytemuck::Zeroable::zeroed() };
-        recorder.gpu.write(&self.background, 0, bytemuck::bytes_of(&background));
         loop {
-            self.reserve_view(recorder, splats.capacity, size_px, false)?;
-            reserve_image(recorder, &mut self.image_buffers, size_px, false)?;
-            let (status, view, image_buffers) =
-                (&self.status, &self.view, self.image_buffers.as_ref().ok_or(Error::DeviceLost)?);
-            let Recorder { gpu, passes: list } = recorder;
-            write_n_splats(gpu, status, splats.n_splats);
-            let passes = ViewPasses { gpu, splats, scratch: self.scratch()?, image_buffers, status, view, size_px };
-            passes.draw(list, &self.pipelines);
-            passes.finish(list, &self.pipelines, &self.background);
-            let mut read = vec![(status, 4 * status::LEN)];
-            match parts {
-                ReadParts::Picture { depth } => {
-                    let depths = depth.then_some(&image_buffers.depths);
-                    read.extend(Picture::buffers(size_px, &image_buffers.pixels, depths));
-                }
-                ReadParts::Comparison { score, image } => {
-                    let n_bytes = products::record(gpu, list, score, (view, image_buffers), size_px, image);
-                    read.push((&image_buffers.products, n_bytes));
-                }
-            }
-            let (counters, taken) = list.submit_reading(gpu, &read).finish_with(gpu, |parts| {
+            let (counters, taken) = self.submit(recorder, drawn, parts)?.finish_with(&recorder.gpu, |parts| {
                 let counters: Vec<u32> = bytemuck::pod_collect_to_vec(parts[0]);
-                let taken = (counters[status::FAILED] == 0).then(|| take(&parts[1..]));
-                (counters, taken)
+                (counters, is_complete(parts[0]).then(|| take(&parts[1..])))
             })?;
             if let Some(taken) = taken {
                 return Ok(taken);
@@ -152,6 +149,45 @@ impl Renderer {
             }
             clear_failure(&recorder.gpu, &self.status);
         }
+    }
+
+    /// Submits the passes that draw a view. Reads the counters and the requested parts back.
+    fn submit(
+        &mut self,
+        recorder: &mut Recorder,
+        DrawnView { splats, camera, background_srgb: [red, green, blue] }: DrawnView<'_>,
+        parts: ReadParts<'_>,
+    ) -> Result<PendingRead, Error> {
+        let size_px = camera.size_px;
+        recorder.gpu.write(&self.view, 0, bytemuck::bytes_of(&camera.view()));
+        let background = Supervision { background_srgb: [red, green, blue, 0.0], ..bytemuck::Zeroable::zeroed() };
+        recorder.gpu.write(&self.background, 0, bytemuck::bytes_of(&background));
+        self.reserve_view(recorder, splats.capacity, size_px, false)?;
+        reserve_image(recorder, &mut self.image_buffers, size_px, false)?;
+        let (status, view, image_buffers) =
+            (&self.status, &self.view, self.image_buffers.as_ref().ok_or(Error::DeviceLost)?);
+        let scratch = self.scratch.as_ref().map(|(_, scratch)| scratch).ok_or(Error::DeviceLost)?;
+        let Recorder { gpu, passes: list } = recorder;
+        write_n_splats(gpu, status, splats.n_splats);
+        let passes = ViewPasses { gpu, splats, scratch, image_buffers, status, view, size_px };
+        passes.draw(list, &self.pipelines);
+        passes.finish(list, &self.pipelines, &self.background);
+        let mut read = vec![(status, 4 * status::LEN)];
+        match parts {
+            ReadParts::Picture(Output::Picture { depth }) => {
+                let depths = depth.then_some(&image_buffers.depths);
+                read.extend(Picture::buffers(size_px, &image_buffers.pixels, depths));
+            }
+            ReadParts::Picture(Output::Packed(packing)) => {
+                let canvas = [&image_buffers.pixels, &image_buffers.depths];
+                read.extend(self.packer.get(gpu)?.record(gpu, list, packing, size_px, canvas)?);
+            }
+            ReadParts::Comparison { score, image } => {
+                let n_bytes = products::record(gpu, list, score, (view, image_buffers), size_px, image);
+                read.push((&image_buffers.products, n_bytes));
+            }
+        }
+        Ok(list.submit_reading(gpu, &read))
     }
 
     /// The scratch buffers, which must be reserved first.
@@ -226,6 +262,11 @@ impl Renderer {
         self.scratch = Some((size, made?));
         Ok(())
     }
+}
+
+/// Whether the buffers were large enough, according to the counters that were read back.
+fn is_complete(counters: &[u8]) -> bool {
+    counters[4 * status::FAILED..4 * (status::FAILED + 1)] == [0; 4]
 }
 
 /// Reserves buffers for a picture of this size, including its gradients if `learned`.

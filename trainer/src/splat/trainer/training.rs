@@ -57,6 +57,16 @@ impl SplatTrainer {
         self.write_settings();
         self.record_step(&learn, self.schedule.step)?;
         let timings = self.recorder.passes.submit_timed(&self.recorder.gpu)?;
+        let place = self.views.of_step(self.schedule.step);
+        let counts = self.work_counts(self.views.size_px(place))?;
+        log::info!(
+            "splat: {} splats in tiles, {} of them visible; longest list {}, {} of them visible; largest splat touches {} tiles",
+            counts.n_intersections,
+            counts.n_visible,
+            counts.longest_list,
+            counts.longest_visible,
+            counts.largest_splat
+        );
         self.schedule.step += 1;
         Ok(timings)
     }

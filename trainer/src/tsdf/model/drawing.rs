@@ -2,10 +2,11 @@
 
 use super::TsdfModel;
 use super::frustum::ViewFrustum;
+use crate::packing::Output;
 use crate::tsdf::chosen_grid::VoxelGrid;
 use crate::tsdf::passes::{self, Canvas};
 use crate::view::Camera;
-use crate::{Error, Picture, Projection, RenderRequest};
+use crate::{Error, Projection, RenderRequest, Rendered};
 
 impl TsdfModel {
     /// Renders one pinhole view.
@@ -13,17 +14,14 @@ impl TsdfModel {
         &mut self,
         camera: &Camera,
         background_srgb: [f32; 3],
-        depth: bool,
-    ) -> Result<Picture, Error> {
+        output: Output,
+    ) -> Result<Rendered, Error> {
         if !self.record_picture(camera, background_srgb)? {
-            return Ok(Picture::empty(camera.size_px, background_srgb, depth));
+            return Ok(Rendered::empty(camera.size_px, background_srgb, output));
         }
         let canvas = self.canvas.as_ref().ok_or(Error::DeviceLost)?;
-        let read = self.passes.submit_reading(
-            &self.gpu,
-            &Picture::buffers(camera.size_px, &canvas.pixels, depth.then_some(&canvas.depths)),
-        );
-        read.finish_with(&self.gpu, |parts| Picture::from_parts(camera.size_px, parts))
+        let canvas = [&canvas.pixels, &canvas.depths];
+        self.packer.read(&self.gpu, &mut self.passes, output, camera.size_px, canvas)
     }
 
     /// Renders a pinhole view without reading it back, and returns its GPU time in milliseconds. Returns `None` if the

@@ -1,0 +1,560 @@
+//! Packs pictures on the GPU for viewers: color as JPEG, depth as 16-bit counts at half size. The data to read back is a
+//! tenth of the picture's, and the processor has nothing left to compute.
+
+mod tables;
+
+use crate::gpu::{Buffer, Gpu, Kernel, Passes, PendingRead, Pipeline, Source};
+use crate::view::{Camera, projections};
+use crate::{Error, Picture, Projection, RenderRequest};
+
+/// Squares of 8 x 8 pixels per restart interval, which one lane encodes.
+const MCUS_PER_INTERVAL: u32 = 8;
+/// Capacity of an interval, in words: twice the average of a file of [`WORDS_PER_MCU`].
+const WORDS_PER_INTERVAL: u32 = 2 * WORDS_PER_MCU * MCUS_PER_INTERVAL;
+/// Maximum average of coded words per square. At quality 92, pictures of splats need about 6.
+const WORDS_PER_MCU: u32 = 16;
+/// Words before the coded words.
+const HEADER_WORDS: u32 = 4;
+
+/// How a drawn picture is read back.
+#[derive(Clone, Copy, Debug)]
+pub(crate) enum Output {
+    Picture { depth: bool },
+    Packed(Packing),
+}
+
+impl Output {
+    /// Packs only on GPUs. On a software adapter, kernels take longer than the encoders of the server.
+    pub(crate) fn on(self, gpu: &Gpu) -> Self {
+        match self {
+            Self::Packed(Packing { depth, .. }) if gpu.is_software() => Self::Picture { depth },
+            _ => self,
+        }
+    }
+}
+
+/// What to pack.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Packing {
+    /// Quality of the JPEG file, 1 to 100; `None` to omit the color.
+    pub jpeg_quality: Option<u8>,
+    /// Whether depth is included.
+    pub depth: bool,
+}
+
+/// A picture as sent to viewers.
+#[derive(Clone, Debug)]
+pub struct PackedPicture {
+    /// Width and height of the color, pixels.
+    pub size_px: [u32; 2],
+    /// A JPEG file with color at full resolution, if requested.
+    pub jpeg: Option<Vec<u8>>,
+    /// Depth, if requested.
+    pub depth: Option<PackedDepth>,
+}
+
+/// Depth at half size, rounded up. Each square of 2 x 2 pixels keeps its nearest depth, so that thin objects in front
+/// stay visible.
+#[derive(Clone, Debug)]
+pub struct PackedDepth {
+    /// Width and height.
+    pub size_px: [u32; 2],
+    /// Length of a step of the counts, meters.
+    pub meters_per_count: f64,
+    /// `[height, width]`, 16-bit little-endian counts along z; 0 where nothing is visible.
+    pub counts: Vec<u8>,
+}
+
+/// A rendered picture, packed if the model and the adapter support it.
+#[derive(Clone, Debug)]
+pub enum Rendered {
+    /// Pixels and depths.
+    Picture(Picture),
+    /// Packed on the GPU.
+    Packed(PackedPicture),
+}
+
+impl From<Picture> for Rendered {
+    fn from(picture: Picture) -> Self {
+        Self::Picture(picture)
+    }
+}
+
+/// A picture that the GPU may still be drawing, so that several can be queued.
+#[derive(Debug)]
+pub struct QueuedPicture(Queued);
+
+#[derive(Debug)]
+enum Queued {
+    Ready(Rendered),
+    /// Reads counters, and what [`Packer::record`] returns. The counters tell whether the picture is complete.
+    Packed {
+        read: PendingRead,
+        is_complete: fn(&[u8]) -> bool,
+        packing: Packing,
+        size_px: [u32; 2],
+    },
+}
+
+impl QueuedPicture {
+    /// A finished picture.
+    pub fn ready(rendered: Rendered) -> Self {
+        Self(Queued::Ready(rendered))
+    }
+
+    /// A picture on the GPU. The first part of `read` tells `is_complete` whether the buffers were large enough; the others
+    /// are those of [`Packer::record`].
+    pub(crate) fn packed(
+        read: PendingRead,
+        is_complete: fn(&[u8]) -> bool,
+        packing: Packing,
+        size_px: [u32; 2],
+    ) -> Self {
+        Self(Queued::Packed { read, is_complete, packing, size_px })
+    }
+
+    /// Waits for the picture. `None` if a buffer was too small: [`Method::render_packed`](crate::Method::render_packed)
+    /// makes it larger.
+    ///
+    /// # Errors
+    ///
+    /// If the GPU failed.
+    pub fn finish(self, gpu: &Gpu) -> Result<Option<Rendered>, Error> {
+        match self.0 {
+            Queued::Ready(rendered) => Ok(Some(rendered)),
+            Queued::Packed { read, is_complete, packing, size_px } => read.finish_with(gpu, |parts| {
+                let packed = is_complete(parts[0]).then(|| unpack(packing, size_px, &parts[1..]));
+                packed.flatten().map(Rendered::Packed)
+            }),
+        }
+    }
+}
+
+impl Rendered {
+    /// Renders a request with `draw`, which draws and reads back a pinhole view. Other projections are not packed.
+    pub(crate) fn of(
+        request: &RenderRequest,
+        packing: Packing,
+        mut draw: impl FnMut(&Camera, Output) -> Result<Self, Error>,
+    ) -> Result<Self, Error> {
+        if let Projection::Pinhole { focal_px, principal_px } = request.projection {
+            return draw(&Camera::from_request(request, focal_px, principal_px), Output::Packed(packing));
+        }
+        Self::picture(request, draw).map(Self::Picture)
+    }
+
+    /// Renders a request without packing it. `draw` draws and reads back a pinhole view.
+    pub(crate) fn picture(
+        request: &RenderRequest,
+        mut draw: impl FnMut(&Camera, Output) -> Result<Self, Error>,
+    ) -> Result<Picture, Error> {
+        projections::render(request, |camera| match draw(camera, Output::Picture { depth: request.depth })? {
+            Self::Picture(picture) => Ok(picture),
+            Self::Packed(_) => Err(Error::DeviceLost), // A picture was requested.
+        })
+    }
+
+    /// A picture that shows only the background.
+    pub(crate) fn empty(size_px: [u32; 2], background_srgb: [f32; 3], output: Output) -> Self {
+        let (Output::Picture { depth } | Output::Packed(Packing { depth, .. })) = output;
+        Self::Picture(Picture::empty(size_px, background_srgb, depth))
+    }
+
+    /// Width and height, pixels.
+    pub fn size_px(&self) -> [u32; 2] {
+        match self {
+            Self::Picture(picture) => picture.size_px,
+            Self::Packed(packed) => packed.size_px,
+        }
+    }
+}
+
+/// `Packing` of packing.wgsl.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, bytemuck::Pod, bytemuck::Zeroable)]
+struct Sizes {
+    size_px: [u32; 2],
+    n_mcus: [u32; 2],
+    n_intervals: u32,
+    mcus_per_interval: u32,
+    words_per_interval: u32,
+    n_words: u32,
+}
+
+impl Sizes {
+    fn of(size_px: [u32; 2]) -> Self {
+        let n_mcus = size_px.map(|n| n.div_ceil(8));
+        let n = n_mcus[0] * n_mcus[1];
+        Self {
+            size_px,
+            n_mcus,
+            n_intervals: n.div_ceil(MCUS_PER_INTERVAL),
+            mcus_per_interval: MCUS_PER_INTERVAL,
+            words_per_interval: WORDS_PER_INTERVAL,
+            n_words: WORDS_PER_MCU * n.next_multiple_of(MCUS_PER_INTERVAL),
+        }
+    }
+
+    fn n_mcus(&self) -> u32 {
+        self.n_mcus[0] * self.n_mcus[1]
+    }
+
+    fn half_size_px(&self) -> [u32; 2] {
+        self.size_px.map(|n| n.div_ceil(2))
+    }
+
+    fn n_squares(&self) -> u32 {
+        self.half_size_px()[0] * self.half_size_px()[1]
+    }
+}
+
+const SHARED: &[Source] = &[
+    Source { name: "packing", text: include_str!("packing.wgsl") },
+    Source { name: "folded", text: include_str!("../shared/folded.wgsl") },
+    Source { name: "scan", text: include_str!("../shared/scan.wgsl") },
+];
+
+macro_rules! kernel {
+    ($name:literal) => {
+        Kernel { source: Source { name: $name, text: include_str!(concat!($name, ".wgsl")) }, shared: SHARED }
+    };
+}
+
+/// Kernels and buffers that pack pictures.
+#[derive(Debug)]
+pub(crate) struct Packer {
+    transform: Pipeline,
+    code: Pipeline,
+    offsets: Pipeline,
+    join: Pipeline,
+    halve: Pipeline,
+    count: Pipeline,
+    codes: Buffer,
+    /// Table of the last quality.
+    tables: Option<(u8, Buffer)>,
+    buffers: Option<Buffers>,
+}
+
+#[derive(Debug)]
+struct Buffers {
+    /// Capacities: squares of 8 x 8 and of 2 x 2 pixels.
+    n_mcus: u32,
+    n_squares: u32,
+    packing: Buffer,
+    coefficients: Buffer,
+    non_zero: Buffer,
+    coded: Buffer,
+    n_coded: Buffer,
+    halved: Buffer,
+    packed: Buffer,
+    depth_counts: Buffer,
+}
+
+impl Buffers {
+    fn new(gpu: &Gpu, sizes: Sizes) -> Result<Self, Error> {
+        let words = |name: &str, n: u32| gpu.storage(name, 4 * u64::from(n));
+        let (n_mcus, n_squares) = (sizes.n_mcus(), sizes.n_squares());
+        Ok(Self {
+            n_mcus,
+            n_squares,
+            packing: gpu.uniform_with("packing.packing", &sizes),
+            coefficients: words("packing.coefficients", 3 * 64 * n_mcus)?,
+            non_zero: words("packing.non_zero", 6 * n_mcus)?,
+            coded: words("packing.coded", WORDS_PER_INTERVAL * sizes.n_intervals)?,
+            n_coded: words("packing.n_coded", sizes.n_intervals)?,
+            halved: words("packing.halved", n_squares)?,
+            packed: words("packing.packed", HEADER_WORDS + sizes.n_words)?,
+            depth_counts: words("packing.depth_counts", n_squares.div_ceil(2))?,
+        })
+    }
+}
+
+impl Packer {
+    /// Compiles the kernels.
+    pub(crate) fn new(gpu: &Gpu) -> Result<Self, Error> {
+        Ok(Self {
+            transform: Pipeline::new(gpu, kernel!("jpeg_transform"), &[])?,
+            code: Pipeline::new(gpu, kernel!("jpeg_code"), &[])?,
+            offsets: Pipeline::new(gpu, kernel!("jpeg_offsets"), &[])?,
+            join: Pipeline::new(gpu, kernel!("jpeg_join"), &[])?,
+            halve: Pipeline::new(gpu, kernel!("depth_halve"), &[])?,
+            count: Pipeline::new(gpu, kernel!("depth_counts"), &[])?,
+            codes: gpu.storage_with("packing.codes", bytemuck::cast_slice(&tables::codes()))?,
+            tables: None,
+            buffers: None,
+        })
+    }
+
+    /// Records the passes that pack a picture of `size_px`: `pixels` (rgba8) and `depths` (meters). Returns the buffers to
+    /// read back for [`unpack`].
+    pub(crate) fn record(
+        &mut self,
+        gpu: &Gpu,
+        passes: &mut Passes,
+        packing: Packing,
+        size_px: [u32; 2],
+        [pixels, depths]: [&Buffer; 2],
+    ) -> Result<Vec<(&Buffer, usize)>, Error> {
+        let sizes = Sizes::of(size_px);
+        let fits = |buffers: &Buffers| buffers.n_mcus >= sizes.n_mcus() && buffers.n_squares >= sizes.n_squares();
+        if !self.buffers.as_ref().is_some_and(fits) {
+            passes.clear_bindings();
+            self.buffers = None; // Freed before the larger ones are allocated.
+            self.buffers = Some(Buffers::new(gpu, sizes)?);
+        }
+        if let Some(quality) = packing.jpeg_quality
+            && self.tables.as_ref().is_none_or(|(of, _)| *of != quality)
+        {
+            passes.clear_bindings();
+            let tables = tables::transform_tables(quality);
+            self.tables = Some((quality, gpu.storage_with("packing.tables", bytemuck::cast_slice(&tables))?));
+        }
+        let Self { transform, code, offsets, join, halve, count, codes, tables, buffers } = self;
+        let buffers = buffers.as_ref().ok_or(Error::DeviceLost)?;
+        gpu.write(&buffers.packing, 0, bytemuck::bytes_of(&sizes));
+        let uniform = ("packing", &buffers.packing);
+        let packed = ("packed", &buffers.packed);
+        let [coefficients, non_zero] = [("coefficients", &buffers.coefficients), ("non_zero", &buffers.non_zero)];
+        let [coded, n_coded] = [("coded", &buffers.coded), ("n_coded", &buffers.n_coded)];
+        passes.clear_range(&buffers.packed, 0..4 * u64::from(HEADER_WORDS));
+        let mut n_words = HEADER_WORDS;
+        if let Some((_, tables)) = tables.as_ref().filter(|_| packing.jpeg_quality.is_some()) {
+            n_words += sizes.n_words;
+            let n_intervals = u64::from(sizes.n_intervals);
+            let transformed = [uniform, ("pixels", pixels), ("tables", tables), coefficients, non_zero];
+            passes.dispatch(gpu, transform, sizes.n_mcus().into(), &transformed);
+            let encoded = [uniform, coefficients, non_zero, ("codes", &*codes), coded, n_coded, packed];
+            passes.dispatch(gpu, code, n_intervals.div_ceil(64), &encoded);
+            passes.dispatch(gpu, offsets, 1, &[uniform, n_coded, packed]);
+            passes.dispatch(gpu, join, n_intervals, &[uniform, coded, n_coded, packed]);
+        }
+        let mut reads = vec![(packed.1, 4 * n_words as usize)];
+        if packing.depth {
+            let n_squares = u64::from(sizes.n_squares());
+            let halved = ("halved", &buffers.halved);
+            let counts = ("depth_counts", &buffers.depth_counts);
+            passes.dispatch(gpu, halve, n_squares.div_ceil(256), &[uniform, ("depths", depths), halved, packed]);
+            passes.dispatch(gpu, count, n_squares.div_ceil(512), &[uniform, halved, packed, counts]);
+            reads.push((counts.1, 2 * sizes.n_squares() as usize));
+        }
+        Ok(reads)
+    }
+}
+
+/// A packer, compiled when a packed picture is requested for the first time.
+#[derive(Debug, Default)]
+pub(crate) struct LazyPacker(Option<Packer>);
+
+impl LazyPacker {
+    /// The packer.
+    pub(crate) fn get(&mut self, gpu: &Gpu) -> Result<&mut Packer, Error> {
+        if self.0.is_none() {
+            self.0 = Some(Packer::new(gpu)?);
+        }
+        self.0.as_mut().ok_or(Error::DeviceLost)
+    }
+
+    /// Submits the passes that draw a picture into `pixels` (rgba8) and `depths` (meters), and reads it back.
+    pub(crate) fn read(
+        &mut self,
+        gpu: &Gpu,
+        passes: &mut Passes,
+        output: Output,
+        size_px: [u32; 2],
+        canvas: [&Buffer; 2],
+    ) -> Result<Rendered, Error> {
+        let has_depth = match output.on(gpu) {
+            Output::Picture { depth } => depth,
+            Output::Packed(packing) => {
+                let reads = self.get(gpu)?.record(gpu, passes, packing, size_px, canvas)?;
+                let read = passes.submit_reading(gpu, &reads);
+                if let Some(packed) = read.finish_with(gpu, |parts| unpack(packing, size_px, parts))? {
+                    return Ok(Rendered::Packed(packed));
+                }
+                packing.depth
+            }
+        };
+        read_picture(gpu, passes, size_px, canvas, has_depth).map(Rendered::Picture)
+    }
+}
+
+/// Submits the passes and reads the picture back as it is.
+pub(crate) fn read_picture(
+    gpu: &Gpu,
+    passes: &mut Passes,
+    size_px: [u32; 2],
+    [pixels, depths]: [&Buffer; 2],
+    has_depth: bool,
+) -> Result<Picture, Error> {
+    let read = passes.submit_reading(gpu, &Picture::buffers(size_px, pixels, has_depth.then_some(depths)));
+    read.finish_with(gpu, |parts| Picture::from_parts(size_px, parts))
+}
+
+/// Assembles the data read back from [`Packer::record`]. `None` if the JPEG file was too long.
+pub(crate) fn unpack(packing: Packing, size_px: [u32; 2], parts: &[&[u8]]) -> Option<PackedPicture> {
+    let (header, coded) = parts[0].split_at(4 * HEADER_WORDS as usize);
+    let header: Vec<u32> = bytemuck::pod_collect_to_vec(header);
+    let [n_words, overflow, furthest, _] = header[..] else { return None };
+    if overflow != 0 {
+        return None;
+    }
+    let jpeg = match packing.jpeg_quality {
+        Some(quality) => {
+            let [Ok(width), Ok(height)] = size_px.map(u16::try_from) else { return None };
+            let interval = u16::try_from(MCUS_PER_INTERVAL).ok()?;
+            let mut file = tables::file_header([width, height], quality, interval);
+            file.extend_from_slice(coded.get(..4 * n_words as usize)?);
+            Some(file)
+        }
+        None => None,
+    };
+    let depth = parts.get(1).map(|counts| {
+        let furthest_m = f64::from(f32::from_bits(furthest));
+        PackedDepth {
+            size_px: Sizes::of(size_px).half_size_px(),
+            meters_per_count: if furthest_m > 0.0 { furthest_m / f64::from(u16::MAX) } else { 1.0 },
+            counts: counts.to_vec(),
+        }
+    });
+    Some(PackedPicture { size_px, jpeg, depth })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::gpu::GpuOptions;
+    use crate::gpu::testing::{assert_layout, assert_valid};
+
+    const KERNELS: &[Kernel] = &[
+        kernel!("jpeg_transform"),
+        kernel!("jpeg_code"),
+        kernel!("jpeg_offsets"),
+        kernel!("jpeg_join"),
+        kernel!("depth_halve"),
+        kernel!("depth_counts"),
+    ];
+
+    #[test]
+    fn kernels_are_valid() {
+        use Sizes as Packing;
+        assert_valid(KERNELS);
+        assert_layout!(
+            KERNELS,
+            Packing,
+            [size_px, n_mcus, n_intervals, mcus_per_interval, words_per_interval, n_words]
+        );
+    }
+
+    struct Fixture {
+        gpu: std::sync::Arc<Gpu>,
+        packer: Packer,
+        passes: Passes,
+    }
+
+    impl Fixture {
+        fn new() -> Self {
+            let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+            Self { packer: Packer::new(&gpu).unwrap(), passes: Passes::default(), gpu }
+        }
+
+        fn pack(&mut self, packing: Packing, picture: &Picture) -> Option<PackedPicture> {
+            let pixels = self.gpu.storage_with("pixels", &picture.rgba_srgb).unwrap();
+            let depths = self.gpu.storage_with("depths", bytemuck::cast_slice(&picture.depth_m)).unwrap();
+            let read = {
+                let reads = self
+                    .packer
+                    .record(&self.gpu, &mut self.passes, packing, picture.size_px, [&pixels, &depths])
+                    .unwrap();
+                self.passes.submit_reading(&self.gpu, &reads)
+            };
+            self.passes.clear_bindings();
+            read.finish_with(&self.gpu, |parts| unpack(packing, picture.size_px, parts)).unwrap()
+        }
+    }
+
+    /// Smooth colors with sharp edges, different in every corner. Depths with holes.
+    fn picture(size_px: [u32; 2]) -> Picture {
+        let [width, height] = size_px;
+        let byte = |value: u32| u8::try_from(value % 256).unwrap();
+        let px = || (0..height).flat_map(move |y| (0..width).map(move |x| (x, y)));
+        let color = |(x, y): (u32, u32)| {
+            let stripe = if (x / 13 + y / 7) % 5 == 0 { 90 } else { 0 };
+            [byte(x * 160 / width + stripe), byte(y * 160 / height + stripe), byte(40 + x / 3), 9]
+        };
+        let depth = |(x, y): (u32, u32)| match (x + 3 * y) % 11 {
+            0 => 0.0,
+            1 => f32::INFINITY,
+            2 => f32::NAN,
+            n => n as f32 + 0.01 * (x % 50) as f32,
+        };
+        Picture { size_px, rgba_srgb: px().flat_map(color).collect(), depth_m: px().map(depth).collect() }
+    }
+
+    fn mean_abs_error(jpeg: &[u8], picture: &Picture) -> f64 {
+        let decoded = image::load_from_memory_with_format(jpeg, image::ImageFormat::Jpeg).unwrap().to_rgb8();
+        assert_eq!([decoded.width(), decoded.height()], picture.size_px);
+        let source = picture.rgba_srgb.chunks_exact(4).flat_map(|pixel| &pixel[..3]);
+        let sum: f64 = decoded.as_raw().iter().zip(source).map(|(a, b)| f64::from(a.abs_diff(*b))).sum();
+        sum / decoded.as_raw().len() as f64
+    }
+
+    #[test]
+    fn jpeg_files_are_as_good_as_those_of_a_library() {
+        let mut fixture = Fixture::new();
+        for size_px in [[160, 128], [161, 129], [1, 1], [7, 50], [16, 17], [333, 255], [15, 1000], [64, 8]] {
+            let picture = picture(size_px);
+            for quality in [60, 92] {
+                let packing = Packing { jpeg_quality: Some(quality), depth: false };
+                let jpeg = fixture.pack(packing, &picture).unwrap().jpeg.unwrap();
+                let rgb: Vec<u8> = picture.rgba_srgb.chunks_exact(4).flat_map(|pixel| pixel[..3].to_vec()).collect();
+                let mut by_library = Vec::new();
+                image::codecs::jpeg::JpegEncoder::new_with_quality(&mut by_library, quality)
+                    .encode(&rgb, size_px[0], size_px[1], image::ExtendedColorType::Rgb8)
+                    .unwrap();
+                let (ours, library) = (mean_abs_error(&jpeg, &picture), mean_abs_error(&by_library, &picture));
+                assert!(ours < library + 0.1, "{size_px:?}, quality {quality}: {ours}, by a library {library}");
+                assert!(jpeg.len() < by_library.len() * 5 / 4 + 512, "{} bytes, {}", jpeg.len(), by_library.len());
+            }
+        }
+    }
+
+    #[test]
+    fn noise_that_is_too_long_is_not_packed() {
+        let mut fixture = Fixture::new();
+        let mut picture = picture([256, 256]);
+        for (at, value) in (0u32..).zip(&mut picture.rgba_srgb) {
+            *value = at.wrapping_mul(2_654_435_761).to_be_bytes()[1];
+        }
+        assert!(fixture.pack(Packing { jpeg_quality: Some(100), depth: false }, &picture).is_none());
+        assert!(fixture.pack(Packing { jpeg_quality: Some(20), depth: false }, &picture).is_some());
+    }
+
+    #[test]
+    fn depth_is_the_nearest_of_each_square() {
+        let mut fixture = Fixture::new();
+        for size_px in [[64, 32], [33, 17], [1, 1], [3, 2]] {
+            let picture = picture(size_px);
+            let packed = fixture.pack(Packing { jpeg_quality: None, depth: true }, &picture).unwrap();
+            let depth = packed.depth.unwrap();
+            assert!(packed.jpeg.is_none());
+            let [width, height] = depth.size_px;
+            assert_eq!(depth.size_px, size_px.map(|n| n.div_ceil(2)));
+            assert_eq!(depth.counts.len(), 2 * (width * height) as usize);
+            let counts = depth.counts.chunks_exact(2).map(|pair| u16::from_le_bytes([pair[0], pair[1]]));
+            for (count, at) in counts.zip(0..) {
+                let nearest_m = [[0, 0], [1, 0], [0, 1], [1, 1]]
+                    .map(|[x, y]| [2 * (at % width) + x, 2 * (at / width) + y])
+                    .into_iter()
+                    .filter(|px| px[0] < size_px[0] && px[1] < size_px[1])
+                    .map(|px| picture.depth_m[(px[1] * size_px[0] + px[0]) as usize])
+                    .filter(|depth_m| depth_m.is_finite() && *depth_m > 0.0)
+                    .fold(f32::INFINITY, f32::min);
+                let got_m = f64::from(count) * depth.meters_per_count;
+                match nearest_m.is_finite() {
+                    true => assert!((got_m - f64::from(nearest_m)).abs() < depth.meters_per_count, "{at}"),
+                    false => assert_eq!(count, 0),
+                }
+            }
+        }
+    }
+}
