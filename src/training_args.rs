@@ -43,8 +43,9 @@ pub(crate) struct TrainingArgs {
     /// GPU: auto, in a live run without optimizing parameters with the scene]
     #[arg(long, value_name = "PARAMS", value_delimiter = ',', hide_possible_values = true, value_parser = refine())]
     pub(crate) refine: Vec<Refine>,
-    /// How the number of splats is chosen: to-cap (grow to --max-splats) or tested (grow to --max-splats, then halve as
-    /// long as that costs less than 0.1 dB on validation images) [default: to-cap; for data on disk with a GPU: tested]
+    /// How the number of splats is chosen: to-cap (grow to --max-splats) or tested (grow to --max-splats, or less if there
+    /// are fewer than 40 images; then halve as long as that costs less than 0.1 dB on validation images) [default: to-cap;
+    /// for data on disk with a GPU: tested]
     #[arg(long, value_name = "HOW", hide_possible_values = true)]
     pub(crate) count: Option<CountArg>,
 }

@@ -52,6 +52,13 @@ pub enum Candidate {
         /// Splats after.
         to: u32,
     },
+    /// Doubles the number of splats. Models of each part of the images are scored on the other images.
+    Doubled {
+        /// Splats before.
+        from: u32,
+        /// Splats after.
+        to: u32,
+    },
     /// Lowers the degree of the colors.
     ShDegree {
         /// Degree of spherical harmonics before.
@@ -65,14 +72,14 @@ impl Candidate {
     /// Minimum gain of an addition, or maximum loss of a reduction, dB.
     fn min_gain_db(self) -> f64 {
         match self {
-            Self::Halved { .. } => MIN_GAIN_OF_DOUBLING_DB,
+            Self::Halved { .. } | Self::Doubled { .. } => MIN_GAIN_OF_DOUBLING_DB,
             Self::Cameras(_) | Self::ShDegree { .. } => MIN_GAIN_DB,
         }
     }
 
     /// Whether the change makes the model smaller.
     pub fn reduces_model(self) -> bool {
-        !matches!(self, Self::Cameras(_))
+        !matches!(self, Self::Cameras(_) | Self::Doubled { .. })
     }
 }
 
@@ -81,6 +88,7 @@ impl std::fmt::Display for Candidate {
         match self {
             Self::Cameras(params) => params.fmt(f),
             Self::Halved { from, to } => write!(f, "{to} of {from} splats"),
+            Self::Doubled { from, to } => write!(f, "{to} instead of {from} splats"),
             Self::ShDegree { from, to } => write!(f, "colors of degree {to} instead of {from}"),
         }
     }
@@ -124,9 +132,10 @@ impl Trial {
         let standard_error_db = (variance / n).sqrt();
         let (n_images, min_db) = (gains_db.len(), candidate.min_gain_db());
         // In case of doubt, neither additions nor reductions are accepted.
-        let is_significant = match candidate.reduces_model() {
-            true => -gain_db + 0.5 * standard_error_db <= min_db,
-            false => gain_db > f64::max(min_db, MIN_STANDARD_ERRORS * standard_error_db),
+        let is_significant = match candidate {
+            Candidate::Halved { .. } | Candidate::ShDegree { .. } => -gain_db + 0.5 * standard_error_db <= min_db,
+            Candidate::Doubled { .. } => gain_db - standard_error_db > min_db,
+            Candidate::Cameras(_) => gain_db > f64::max(min_db, MIN_STANDARD_ERRORS * standard_error_db),
         };
         Self { candidate, gain_db, standard_error_db, n_images, kept: n_images > 1 && is_significant }
     }
@@ -141,6 +150,7 @@ impl Trial {
     pub fn report(&self) -> TrialReport {
         let (candidate, is_reduction) = match self.candidate {
             Candidate::Cameras(params) => (params.to_string(), false),
+            Candidate::Doubled { from, to } => (format!("{to} instead of {from} splats"), false),
             Candidate::Halved { from, to } => (format!("{from} instead of {to} splats"), true),
             Candidate::ShDegree { from, to } => (format!("colors of degree {from} instead of {to}"), true),
         };

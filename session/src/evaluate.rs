@@ -243,10 +243,12 @@ fn mean(values: impl Iterator<Item = Option<f64>>) -> Option<f64> {
     (n > 0.0).then(|| sum / n)
 }
 
-/// Renders a model at the pose of a keyframe, with the keyframe's rolling shutter and color gains.
+/// Renders a model at the pose of a keyframe, with the model's background and the keyframe's rolling shutter and color
+/// gains.
 pub fn draw(method: &mut dyn Method, keyframe: &Keyframe, depth: bool) -> Result<Picture, trainer::Error> {
     let lens = method.calibrated_camera(keyframe)?;
-    let mut picture = method.render(&RenderRequest { depth, ..request(keyframe, &lens) })?;
+    let background_srgb = method.background_srgb();
+    let mut picture = method.render(&RenderRequest { depth, background_srgb, ..request(keyframe, &lens) })?;
     if lens.gains != [1.0; 3] {
         let by_byte = lens.gains.map(gain_table);
         for [red, green, blue, _] in picture.rgba_srgb.as_chunks_mut::<4>().0 {
@@ -262,7 +264,11 @@ pub fn draw(method: &mut dyn Method, keyframe: &Keyframe, depth: bool) -> Result
 /// the method does not support this, or if gains are applied after rendering.
 fn psnr_on_gpu(method: &mut dyn Method, keyframe: &Keyframe) -> Result<Option<f64>, trainer::Error> {
     let lens = method.calibrated_camera(keyframe)?;
-    if lens.gains == [1.0; 3] { method.psnr(&request(keyframe, &lens), keyframe) } else { Ok(None) }
+    if lens.gains != [1.0; 3] {
+        return Ok(None);
+    }
+    let background_srgb = method.background_srgb();
+    method.psnr(&RenderRequest { background_srgb, ..request(keyframe, &lens) }, keyframe)
 }
 
 /// Renders a model at the pose of a keyframe's depth image. Size and intrinsics come from `depth`, which may be a
@@ -329,7 +335,8 @@ fn depth_error(method: &mut dyn Method, keyframe: &Keyframe) -> crate::Result<De
 fn truth_score(method: &mut dyn Method, keyframe: &Keyframe) -> crate::Result<Option<f64>> {
     let Some(truth) = &keyframe.truth else { return Ok(None) };
     let lens = CalibratedCamera { world_from_camera: truth.world_from_camera, ..method.calibrated_camera(keyframe)? };
-    let at_truth = RenderRequest { shutter: None, ..request(keyframe, &lens) };
+    let background_srgb = method.background_srgb();
+    let at_truth = RenderRequest { shutter: None, background_srgb, ..request(keyframe, &lens) };
     let drawn = method.render(&at_truth)?;
     Ok(Some(psnr(&PixelPair::new(keyframe.size_px, &drawn.rgba_srgb, &truth.rgba_srgb)?)?))
 }

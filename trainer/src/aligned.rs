@@ -336,6 +336,10 @@ impl<M: Recalibrate + 'static> Method for Aligned<M> {
         self.model.psnr(request, keyframe)
     }
 
+    fn background_srgb(&self) -> [f32; 3] {
+        self.model.background_srgb()
+    }
+
     fn depth_stride(&self) -> u32 {
         self.model.depth_stride()
     }

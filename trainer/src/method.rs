@@ -77,6 +77,10 @@ pub trait Method {
     fn psnr(&mut self, _request: &RenderRequest, _keyframe: &Keyframe) -> Result<Option<f64>, Error> {
         Ok(None)
     }
+    /// Background for comparisons with images, sRGB 0 to 1: the expected color of what no training image shows.
+    fn background_srgb(&self) -> [f32; 3] {
+        [0.0; 3]
+    }
     /// Pixel stride along both axes for depth images that are compared with measured ones. Odd; above 1 if rays are
     /// expensive.
     fn depth_stride(&self) -> u32 {

@@ -1,4 +1,4 @@
-//! Camera corrections in the `model.json` of a saved model.
+//! Camera corrections and background in the `model.json` of a saved model.
 
 use crate::Error;
 use calibration::{Alignment, CameraCorrection};
@@ -8,12 +8,14 @@ use std::path::Path;
 /// File that describes a saved model, in the model's folder.
 pub(crate) const METADATA_FILE: &str = "model.json";
 
-/// Camera corrections and alignment of a saved model.
+/// Camera corrections, alignment and background of a saved model.
 #[derive(Default, serde::Deserialize)]
 #[serde(default)]
 pub(crate) struct ModelMetadata {
     pub(crate) cameras: BTreeMap<String, CameraCorrection>,
     pub(crate) alignment: Option<Alignment>,
+    /// See [`crate::Method::background_srgb`].
+    pub(crate) background_srgb: [f32; 3],
 }
 
 /// Reads the camera corrections of a saved model in a folder; empty if the file does not exist or lacks them.

@@ -148,10 +148,16 @@ impl Rendered {
         request: &RenderRequest,
         mut draw: impl FnMut(&Camera, Output) -> Result<Self, Error>,
     ) -> Result<Picture, Error> {
-        projections::render(request, |camera| match draw(camera, Output::Picture { depth: request.depth })? {
+        let output = Output::Picture { depth: request.depth };
+        projections::render(request, |camera| draw(camera, output)?.into_picture())
+    }
+
+    /// The pixels and depths, if the picture is not packed.
+    pub(crate) fn into_picture(self) -> Result<Picture, Error> {
+        match self {
             Self::Picture(picture) => Ok(picture),
-            Self::Packed(_) => Err(Error::DeviceLost), // A picture was requested.
-        })
+            Self::Packed(_) => Err(Error::DeviceLost), // Drawn with another `Output`.
+        }
     }
 
     /// A picture that shows only the background.

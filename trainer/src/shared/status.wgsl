@@ -10,3 +10,5 @@ const STEP = 6u;           // optimizer updates so far
 const N_NON_FINITE = 7u;     // splats whose gradient was dropped because it was non-finite
 const FURTHEST = 8u;       // bits of the largest depth of this view; 0: nothing is visible
 const NEAREST = 9u;        // bits of the smallest depth, inverted
+const DROP_FRAC = 10u;     // written by the host: bits of the fraction of splats that a training step leaves out
+const DROP_SEED = 11u;     // written by the host

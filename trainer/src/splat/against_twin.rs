@@ -7,6 +7,7 @@ use super::camera_params::CameraParams;
 use super::kernels::{DrawPipelines, TrainPipelines};
 use super::params::{Camera, LOW_PASS_PX2, Rule, Supervision, status};
 use super::passes::{Target, ViewPasses};
+use super::reference::random::uniform3;
 use super::reference::{self, RenderedImage, Splat, Upstream, View, scene};
 use crate::gpu::{Buffer, Gpu, GpuOptions, Passes, f32_of};
 use crate::loss::reference as loss_reference;
@@ -129,38 +130,66 @@ pub(super) fn unambiguous_pixels(view: &View, splats: &[Splat]) -> Vec<bool> {
 fn pictures_match_the_twin() {
     for (view, seed) in [(scene::tilted_view(), 1), (scene::rolling_view(), 2)] {
         let splats = scene::small_scene(seed, 40);
-        let expected = reference::render(&view, &splats);
-        let unambiguous = unambiguous_pixels(&view, &splats);
-        let fixture = KernelFixture::new(&GpuOptions::default(), &view, &arrays_of(&splats));
-        let (image, depth) = fixture.render();
-        let mut mismatches = Mismatches::default();
-        for pixel in (0..image.len()).filter(|pixel| unambiguous[*pixel]) {
-            for channel in 0..3 {
-                mismatches.check(
-                    format!("pixel {pixel} channel {channel}"),
-                    image[pixel][channel].into(),
-                    expected.rgb[pixel][channel],
-                    COLOR_ABS,
-                    0.0,
-                );
-            }
+        check_picture(&KernelFixture::new(&GpuOptions::default(), &view, &arrays_of(&splats)), &view, &splats);
+    }
+}
+
+/// A step renders the splats that it does not leave out, with higher opacities.
+#[test]
+fn pictures_with_dropped_splats_match_the_twin() {
+    const DROP_FRAC: f32 = 0.25;
+    const SEED: u32 = 7;
+    let view = scene::tilted_view();
+    let mut splats = scene::small_scene(1, 40);
+    splats.iter_mut().for_each(|splat| splat.opacity_logit = splat.opacity_logit.min(0.5));
+    let fixture = KernelFixture::new(&GpuOptions::default(), &view, &arrays_of(&splats));
+    let write =
+        |counter: usize, value: u32| fixture.gpu.write(&fixture.status, 4 * counter as u64, &value.to_le_bytes());
+    write(status::DROP_FRAC, DROP_FRAC.to_bits());
+    write(status::DROP_SEED, SEED);
+    let kept_at = |step: u32| -> Vec<u32> {
+        (0..40).filter(|splat_ix| uniform3([*splat_ix, step, SEED])[0] >= DROP_FRAC.into()).collect()
+    };
+    assert!((20..40).contains(&kept_at(0).len()) && kept_at(0) != kept_at(1), "{:?}", kept_at(0));
+    for step in [0, 1] {
+        write(status::STEP, step);
+        let more_opaque = |splat_ix: u32| {
+            let mut splat = splats[splat_ix as usize].clone();
+            let opacity = 1.0 / (1.0 + (-splat.opacity_logit).exp()) / (1.0 - f64::from(DROP_FRAC));
+            splat.opacity_logit = (opacity / (1.0 - opacity)).ln();
+            splat
+        };
+        let rendered: Vec<Splat> = kept_at(step).into_iter().map(more_opaque).collect();
+        check_picture(&fixture, &view, &rendered);
+    }
+}
+
+/// Compares the fixture's picture with that of the twin.
+fn check_picture(fixture: &KernelFixture, view: &View, splats: &[Splat]) {
+    let expected = reference::render(view, splats);
+    let unambiguous = unambiguous_pixels(view, splats);
+    let (image, depth) = fixture.render();
+    let mut mismatches = Mismatches::default();
+    for pixel in (0..image.len()).filter(|pixel| unambiguous[*pixel]) {
+        for channel in 0..3 {
             mismatches.check(
-                format!("transmittance {pixel}"),
-                image[pixel][3].into(),
-                expected.transmittance[pixel],
+                format!("pixel {pixel} channel {channel}"),
+                image[pixel][channel].into(),
+                expected.rgb[pixel][channel],
                 COLOR_ABS,
                 0.0,
             );
-            mismatches.check(
-                format!("depth {pixel}"),
-                depth[pixel].into(),
-                expected.depth[pixel],
-                10.0 * COLOR_ABS,
-                0.0,
-            );
         }
-        mismatches.assert_none();
+        mismatches.check(
+            format!("transmittance {pixel}"),
+            image[pixel][3].into(),
+            expected.transmittance[pixel],
+            COLOR_ABS,
+            0.0,
+        );
+        mismatches.check(format!("depth {pixel}"), depth[pixel].into(), expected.depth[pixel], 10.0 * COLOR_ABS, 0.0);
     }
+    mismatches.assert_none();
 }
 
 pub(super) fn target_of(image: &RenderedImage, size_px: [u32; 2]) -> loss_reference::Target {

@@ -79,7 +79,7 @@ fn wrong_extrinsics_are_corrected_and_resuming_is_exact() {
     uninterrupted.save(folder.path()).unwrap();
     let arrays = ply::read(&folder.path().join("splats.ply")).unwrap();
     let trainer = SplatTrainer::from_arrays(gpu, ModelOptions::default(), &arrays).unwrap();
-    let trainer = trainer.with_saved_corrections(folder.path()).unwrap();
+    let trainer = trainer.with_saved_metadata(folder.path()).unwrap();
     let mut loaded = Aligned::load(trainer, folder.path()).unwrap();
     assert_eq!(loaded.calibrated_camera(test).unwrap(), correction.apply(test));
 }

@@ -56,7 +56,7 @@ fn load(gpu: Arc<Gpu>, model: &Path) -> Result<Box<dyn Method>, Error> {
     let options = SplatOptions { max_splats, ..SplatOptions::default() };
     let trainer = SplatTrainer::from_arrays(gpu, options.into(), &splats)?;
     Ok(match model.is_dir() {
-        true => Box::new(Aligned::load(trainer.with_saved_corrections(model)?, model)?),
+        true => Box::new(Aligned::load(trainer.with_saved_metadata(model)?, model)?),
         false => Box::new(trainer),
     })
 }

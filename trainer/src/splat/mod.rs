@@ -15,7 +15,11 @@ mod change_against_twin;
 mod checkpoint_tests;
 pub mod cloud;
 mod entry;
+mod few_images;
 mod file;
+mod growth_search;
+#[cfg(test)]
+mod growth_search_tests;
 pub mod kernels;
 #[cfg(test)]
 mod non_finite_tests;

@@ -29,6 +29,9 @@ pub struct SplatOptions {
     /// Scale of the noise added to the means, relative to their learning rate. The noise is largest for transparent
     /// splats.
     pub noise: f64,
+    /// Maximum fraction of the splats that a step leaves out at random. It is reached if there are few images, and zero
+    /// if there are many.
+    pub drop_frac: f64,
     /// Steps at which training switches from a quarter to half of the resolution, and from half to the full
     /// resolution. `None` selects a default for the adapter. It is higher on a CPU, where the duration of a step is
     /// proportional to the number of pixels.
@@ -53,6 +56,7 @@ impl Default for SplatOptions {
             cost_images: 13.0,
             growth_frac: 0.1,
             noise: 5e5,
+            drop_frac: 0.2,
             coarse_steps: None,
             seeds_per_image: None,
         }

@@ -94,6 +94,8 @@ pub(crate) mod status {
     pub(crate) const STEP: usize = 6;
     pub(crate) const N_NON_FINITE: usize = 7;
     pub(crate) const FURTHEST: u32 = 8;
+    pub(crate) const DROP_FRAC: usize = 10;
+    pub(crate) const DROP_SEED: usize = 11;
     /// Length of the array.
     pub(crate) const LEN: usize = 16;
 }

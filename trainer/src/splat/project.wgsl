@@ -1,16 +1,18 @@
 // project: project every splat onto the image plane and compute its color.
 //
 // threads   one per splat
-// reads     view, model, means, rotations, shapes, sh_dc, sh_rest
+// reads     view, model, means, rotations, shapes, sh_dc, sh_rest, status (fraction of dropped splats)
 // writes    projected_splats [n_splats], depth_keys [n_splats] (all ones if invisible), status (smallest and largest depth)
 // twin      splat/reference/project.rs
-// source    Zwicker et al. 2001 (EWA volume splatting); Kerbl et al. 2023, section 4
+// source    Zwicker et al. 2001 (EWA volume splatting); Kerbl et al. 2023, section 4; dropping of splats during training:
+//           Park et al. 2025 (DropGaussian)
 
 #import view
 #import model
 #import projection
 #import sh
 #import status
+#import random
 
 @group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<uniform> model: Model;
@@ -37,16 +39,24 @@ fn add_sh_term(sums: ptr<function, ShSums>, k: u32, basis: f32, basis_gradient: 
     (*sums).color += basis * vec3f(sh_rest[at], sh_rest[at + model.capacity], sh_rest[at + 2u * model.capacity]);
 }
 
+// Whether this step leaves the splat out.
+fn is_dropped(splat_ix: u32, drop_frac: f32) -> bool {
+    if drop_frac == 0.0 { return false; }
+    return uniform3(vec3u(splat_ix, atomicLoad(&status[STEP]), atomicLoad(&status[DROP_SEED]))).x < drop_frac;
+}
+
 // Projects and colors a splat. Returns its depth key.
 fn project(splat_ix: u32) -> u32 {
     let mean = means[splat_ix].xyz;
     let shape = shapes[splat_ix];
     let projection = project_splat(view, mean, rotations[splat_ix], shape.xyz);
-    let opacity = sigmoid(shape.w);
+    // The remaining splats become more opaque, so that the picture keeps its mean opacity.
+    let drop_frac = bitcast<f32>(atomicLoad(&status[DROP_FRAC]));
+    let opacity = sigmoid(shape.w) / (1.0 - drop_frac);
     // These comparisons are false for NaN, so a splat with a NaN is invisible.
     let visible = projection.visible && opacity > MIN_ALPHA && projection.determinant > 0.0 && inside_crop(view, mean)
         && abs(projection.mean_px.x) < 1e6 && abs(projection.mean_px.y) < 1e6 && projection.covariance.x + projection.covariance.z < 1e12;
-    if !visible { return INVISIBLE; }
+    if !visible || is_dropped(splat_ix, drop_frac) { return INVISIBLE; }
 
     let conic = vec3f(projection.covariance.z, -projection.covariance.y, projection.covariance.x) / projection.determinant;
     let reach = 2.0 * log(255.0 * opacity);

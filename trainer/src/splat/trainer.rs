@@ -1,6 +1,7 @@
 //! The splat trainer: implements [`Method`] by combining the modules for training and drawing.
 
 mod checkpoint;
+mod growth_search;
 mod lazy_pipelines;
 mod learning_rates;
 mod model;
@@ -20,7 +21,10 @@ mod work_counts;
 
 use super::arrays::SplatArrays;
 use super::bounds::bounds;
+use super::buffers::SplatBuffers;
+use super::few_images::Scarcity;
 use super::file::IN_FOLDER;
+use super::growth_search::GrowthSearch;
 use super::kernels::TrainPipelines;
 use super::options::SplatOptions;
 use super::params::Camera;
@@ -29,7 +33,7 @@ use super::params::status;
 use super::ply;
 use super::schedule::Schedule;
 use super::seed;
-use super::trials::{SplatTrials, ValidationImage};
+use super::trials::{CountPolicy, SplatTrials, ValidationImage};
 use crate::checkpoint::PendingCheckpoint;
 use crate::gpu::{Gpu, PassTiming};
 use crate::model_metadata::{METADATA_FILE, read_metadata};
@@ -62,8 +66,11 @@ pub struct SplatTrainer {
     views: ViewSet,
     seeding: Seeding,
     trials: SplatTrials,
+    growth_search: GrowthSearch,
     /// Camera corrections loaded with a saved model.
     saved_corrections: BTreeMap<String, CameraCorrection>,
+    /// Background loaded with a saved model.
+    saved_background_srgb: [f32; 3],
 }
 
 impl SplatTrainer {
@@ -87,7 +94,9 @@ impl SplatTrainer {
             views: ViewSet::new(&options, is_software),
             seeding: Seeding::new(&options, is_software),
             trials: SplatTrials::new(&options.common.cameras, options.specific.count),
+            growth_search: GrowthSearch::new(options.specific.count == CountPolicy::Tested),
             saved_corrections: BTreeMap::new(),
+            saved_background_srgb: [0.0; 3],
             recorder: Recorder::new(gpu),
             options,
         })
@@ -106,9 +115,10 @@ impl SplatTrainer {
         Ok(trainer)
     }
 
-    /// Loads the camera corrections of a saved model from its `model.json`.
-    pub fn with_saved_corrections(mut self, folder: &Path) -> Result<Self, Error> {
-        self.saved_corrections = read_metadata(folder)?.cameras;
+    /// Loads the camera corrections and the background of a saved model from its `model.json`.
+    pub fn with_saved_metadata(mut self, folder: &Path) -> Result<Self, Error> {
+        let metadata = read_metadata(folder)?;
+        (self.saved_corrections, self.saved_background_srgb) = (metadata.cameras, metadata.background_srgb);
         Ok(self)
     }
 
@@ -138,7 +148,7 @@ impl SplatTrainer {
     pub fn camera_corrections(&mut self) -> Result<BTreeMap<String, CameraCorrection>, Error> {
         self.finish_in_flight()?;
         let cameras = &self.model.cameras;
-        let displayed = self.trials.baseline().map(|snapshot| &snapshot.cameras);
+        let displayed = self.displayed_state().map(|snapshot| &snapshot.cameras);
         let (set, params) = displayed.map_or((cameras.set, &cameras.params), |(set, params)| (*set, params));
         if set.is_empty() {
             return Ok(self.saved_corrections.clone());
@@ -197,8 +207,8 @@ impl SplatTrainer {
 
     /// Draws one pinhole view of the displayed splats.
     fn draw_view(&mut self, camera: &Camera, background_srgb: [f32; 3], output: Output) -> Result<Rendered, Error> {
-        let drawn = DrawnView { splats: self.trials.displayed(&self.model.splats), camera, background_srgb };
-        self.renderer.picture(&mut self.recorder, drawn, output)
+        let splats = displayed(&self.growth_search, &self.trials, &self.model);
+        self.renderer.picture(&mut self.recorder, DrawnView { splats, camera, background_srgb }, output)
     }
 
     /// Starts to draw and pack a view, on any adapter.
@@ -209,8 +219,8 @@ impl SplatTrainer {
         packing: Packing,
     ) -> Result<QueuedPicture, Error> {
         self.seed_from_depth()?;
-        let drawn = DrawnView { splats: self.trials.displayed(&self.model.splats), camera, background_srgb };
-        self.renderer.queue(&mut self.recorder, drawn, packing)
+        let splats = displayed(&self.growth_search, &self.trials, &self.model);
+        self.renderer.queue(&mut self.recorder, DrawnView { splats, camera, background_srgb }, packing)
     }
 }
 
@@ -232,15 +242,19 @@ impl Method for SplatTrainer {
             self.trials.validation.push(ValidationImage { keyframe, image: None });
             return Ok(());
         }
+        self.abort_growth_search()?; // It is repeated with this keyframe.
         // Both halves of a trial train on the same keyframes at the same steps.
         if self.trials.defer_arrival(&keyframe, self.schedule.step) {
             return Ok(());
         }
-        self.add_arrival(keyframe)
+        self.add_arrival(keyframe)?;
+        self.growth_search.set_n_images(self.n_images());
+        Ok(())
     }
 
     fn remove(&mut self, camera: &str, stamp: Stamp) -> Result<(), Error> {
         self.finish_in_flight()?; // The step of the removal must be exact.
+        self.abort_growth_search()?;
         let is_removed = |keyframe: &Keyframe| keyframe.camera.as_ref() == camera && keyframe.stamp == stamp;
         self.views.retain(|keyframe| !is_removed(keyframe));
         self.seeding.remove(is_removed);
@@ -260,6 +274,13 @@ impl Method for SplatTrainer {
     fn n_total_steps(&mut self) -> Result<u64, Error> {
         self.finish_in_flight()?;
         Ok(self.schedule.step.wrapping_add(self.trials.n_reverted_steps))
+    }
+
+    fn background_srgb(&self) -> [f32; 3] {
+        match self.views.is_empty() {
+            true => self.saved_background_srgb,
+            false => Scarcity::of_images(self.n_images()).background_srgb(self.views.mean_srgb()),
+        }
     }
 
     fn seed(&mut self) -> Result<(), Error> {
@@ -320,9 +341,9 @@ impl Method for SplatTrainer {
     }
 
     fn progress(&self) -> Progress {
-        let displayed = self.trials.displayed(&self.model.splats);
+        let displayed = displayed(&self.growth_search, &self.trials, &self.model);
         Progress {
-            step: self.schedule.step,
+            step: self.displayed_step(),
             primitives: displayed.n_splats.into(),
             bytes: displayed.bytes(),
             step_millis: self.optimizer.submits.step_millis(),
@@ -347,6 +368,7 @@ impl Method for SplatTrainer {
             "seed": self.options.common.seed,
             "trials": self.report(),
             "cameras": self.camera_corrections()?,
+            "background_srgb": self.background_srgb(),
         });
         let path = folder.join(METADATA_FILE);
         std::fs::write(&path, format!("{metadata:#}\n")).map_err(|source| Error::Write { path, source })
@@ -355,6 +377,11 @@ impl Method for SplatTrainer {
     fn checkpoint(&mut self) -> Result<PendingCheckpoint, Error> {
         self.take_checkpoint()
     }
+}
+
+/// The splats to display: during a growth search or a trial, those without the tested change.
+fn displayed<'a>(search: &'a GrowthSearch, trials: &'a SplatTrials, model: &'a TrainedModel) -> &'a SplatBuffers {
+    search.running().map_or_else(|| trials.displayed(&model.splats), |models| &models.main.splats)
 }
 
 /// Accessors for tests.

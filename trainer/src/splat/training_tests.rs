@@ -99,6 +99,23 @@ pub(super) fn n_keyframes(gpu: &Arc<Gpu>, n: usize, with_depth: bool) -> Vec<Arc
         .collect()
 }
 
+/// Adds noise of up to a quarter of the value range. No model can score much more than 21 dB on such images.
+pub(super) fn noisy(keyframes: &[Arc<Keyframe>]) -> Vec<Arc<Keyframe>> {
+    let noisy = |keyframe: &Arc<Keyframe>| {
+        let mut state = keyframe.stamp.0.cast_unsigned();
+        let mut rgba = keyframe.rgba_srgb.to_vec();
+        for pixel in rgba.chunks_exact_mut(4) {
+            for color in &mut pixel[..3] {
+                state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+                let noise = i16::try_from((state >> 33) % 129).unwrap() - 64;
+                *color = u8::try_from((i16::from(*color) + noise).clamp(0, 255)).unwrap();
+            }
+        }
+        Arc::new(Keyframe { rgba_srgb: rgba.into(), ..keyframe.as_ref().clone() })
+    };
+    keyframes.iter().map(noisy).collect()
+}
+
 pub(super) fn options() -> ModelOptions<SplatOptions> {
     ModelOptions {
         common: CommonOptions { n_planned_steps: 300, ..CommonOptions::default() },
@@ -140,7 +157,9 @@ pub(super) fn test_psnr(trainer: &mut SplatTrainer, keyframes: &[Arc<Keyframe>])
         .iter()
         .filter(|keyframe| keyframe.split == Split::Test)
         .map(|keyframe| {
-            let picture = trainer.render(&request(keyframe.world_from_camera)).unwrap();
+            let background_srgb = trainer.background_srgb();
+            let request = RenderRequest { background_srgb, ..request(keyframe.world_from_camera) };
+            let picture = trainer.render(&request).unwrap();
             psnr(&PixelPair::new(SIZE_PX, &picture.rgba_srgb, &keyframe.rgba_srgb).unwrap()).unwrap()
         })
         .collect();
@@ -161,7 +180,8 @@ fn training_predicts_test_views_and_is_reproducible() {
         (before, test_psnr(&mut trainer, &keyframes), trainer.arrays().unwrap())
     };
     let (before, after, arrays) = run(1);
-    assert!(after > before + 3.0 && after > 17.0, "{before} -> {after} dB");
+    // The seeds alone predict the views well.
+    assert!(after > before + 1.0 && after > 28.0, "{before} -> {after} dB");
     assert!(arrays.clone().checked().is_ok(), "a parameter is not finite");
     assert!(run(1).2 == arrays, "the same seed gave a different result");
     assert!(run(2).2 != arrays, "the seed has no effect: the comparison cannot fail");

@@ -42,7 +42,8 @@ pub enum CountPolicy {
     /// Grows up to the limit.
     #[default]
     ToCap,
-    /// Grows up to the limit. Then halves the number repeatedly while this costs less than 0.1 dB on validation images.
+    /// Grows up to the limit, or less if there are few images. Then halves the number repeatedly while this costs less
+    /// than 0.1 dB on validation images.
     Tested,
 }
 
@@ -366,6 +367,7 @@ impl SplatTrials {
         let kept = self.evaluate(candidate, &baseline_db, &variant_db);
         match candidate {
             Candidate::Cameras(_) => drop(self.candidates.pop_front()),
+            Candidate::Doubled { .. } => {} // Tested by the growth search.
             Candidate::Halved { to, .. } if kept && to > MIN_SPLATS => self.count = CountState::Halving,
             Candidate::Halved { .. } => self.count = CountState::Finished,
             Candidate::ShDegree { from, to } => self.degree = if kept { from } else { to + 1 },

@@ -189,7 +189,8 @@ fn update_splat(splat_ix: u32, n_touched: u32, sum: Gradient) -> CameraGradient 
     var v_mean = vec3f(0.0);
     var v_log_scale = vec3f(0.0);
     var v_rotation = vec4f(0.0);
-    let v_opacity_logit = sum.position.w * opacity * (1.0 - opacity);
+    let drop_frac = bitcast<f32>(atomicLoad(&status[DROP_FRAC])); // `project` divides the opacity by one minus this.
+    let v_opacity_logit = sum.position.w * opacity * (1.0 - opacity) / (1.0 - drop_frac);
     if n_touched != 0u {
         // Conic to covariance: the inverse's derivative is -M G M.
         let a = p.covariance.z / p.determinant;

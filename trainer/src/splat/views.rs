@@ -27,6 +27,8 @@ pub(crate) struct TrainView {
     pub(crate) keyframe: Arc<Keyframe>,
     /// Median of the keyframe's depth readings, if any.
     pub(crate) median_depth_m: Option<f64>,
+    /// Mean color of the pixels that are not masked, sRGB; `None` if all are masked.
+    mean_srgb: Option<[f64; 3]>,
     levels: [Option<Level>; 3],
     /// Present once camera parameters are optimized.
     lens: Option<Buffer>,
@@ -134,7 +136,18 @@ pub(crate) fn drop_levels(views: &mut [TrainView], keep: Keep<'_>) -> Vec<Level>
 
 impl TrainView {
     pub(crate) fn new(keyframe: Arc<Keyframe>) -> Self {
-        Self { median_depth_m: median_depth_m(&keyframe), keyframe, levels: [const { None }; 3], lens: None }
+        Self {
+            median_depth_m: median_depth_m(&keyframe),
+            mean_srgb: mean_srgb(&keyframe),
+            keyframe,
+            levels: [const { None }; 3],
+            lens: None,
+        }
+    }
+
+    /// Mean color of the pixels that are not masked, sRGB; `None` if all are masked.
+    pub(crate) fn mean_srgb(&self) -> Option<[f64; 3]> {
+        self.mean_srgb
     }
 
     /// Replaces the camera by that of the same keyframe with other corrections. Uploaded images are kept unless the
@@ -293,6 +306,17 @@ pub(crate) fn camera_of(keyframe: &Keyframe) -> Camera {
         crop: None,
         low_pass_px2: LOW_PASS_PX2,
     }
+}
+
+/// Mean color of a sample of the pixels that are not masked.
+fn mean_srgb(keyframe: &Keyframe) -> Option<[f64; 3]> {
+    const STRIDE: usize = 61; // A prime, so that the sample covers all columns.
+    let (mut sums, mut n) = ([0.0; 3], 0.0);
+    for pixel in keyframe.rgba_srgb.as_chunks::<4>().0.iter().step_by(STRIDE).filter(|pixel| pixel[3] > 0) {
+        n += 1.0;
+        sums.iter_mut().zip(pixel).for_each(|(sum, color)| *sum += f64::from(*color) / 255.0);
+    }
+    (n > 0.0).then(|| sums.map(|sum| sum / n))
 }
 
 /// Averages squares of pixels. A square is masked if any of its pixels is masked.

@@ -9,6 +9,7 @@ use crate::keyframe_signature::{self, KeyframeSignature};
 use crate::model_options::{MethodOptions, ModelOptions};
 use crate::splat::buffers::SplatBuffers;
 use crate::splat::camera_params::CameraSlots;
+use crate::splat::growth_search::{FoldModels, SavedGrowthSearch};
 use crate::splat::options::SplatOptions;
 use crate::splat::params::status;
 use crate::splat::schedule::Schedule;
@@ -41,6 +42,8 @@ struct SavedState {
     slots: CameraSlots,
     remaining_trials: RemainingTrials,
     finished_trials: Vec<Trial>,
+    #[serde(default)]
+    growth_search: SavedGrowthSearch,
     /// The running trial, if any.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     trial: Option<TrialState>,
@@ -183,8 +186,12 @@ impl SplatTrainer {
     pub(super) fn take_checkpoint(&mut self) -> Result<PendingCheckpoint, Error> {
         self.seed_from_depth()?;
         self.finish_in_flight()?;
-        let (gpu, splats, cameras) = (&self.recorder.gpu, &self.model.splats, &self.model.cameras);
-        let (schedule, scene) = (&self.schedule, &self.seeding.scene);
+        let (gpu, cameras) = (&self.recorder.gpu, &self.model.cameras);
+        // A running growth search is not saved but repeated.
+        let (splats, params, schedule, scene) = match self.growth_search.running() {
+            Some(FoldModels { main, .. }) => (&main.splats, &main.cameras.1, &main.schedule, &main.scene),
+            None => (&self.model.splats, &cameras.params, &self.schedule, &self.seeding.scene),
+        };
         let position_of =
             |keyframe: &Arc<Keyframe>| self.views.keyframes().position(|view| Arc::ptr_eq(view, keyframe));
         let state = SavedState {
@@ -200,11 +207,12 @@ impl SplatTrainer {
             slots: cameras.slots(),
             remaining_trials: self.trials.remaining_trials(),
             finished_trials: self.trials.finished.clone(),
+            growth_search: self.growth_search.saved(),
             trial: self.trials.running_trial().map(TrialState::of),
         };
         let state =
             serde_json::to_value(state).map_err(|error| Error::CheckpointState { reason: error.to_string() })?;
-        let params = (&cameras.params, cameras.used_bytes());
+        let params = (params, cameras.used_bytes());
         let mut halves = vec![PendingArrays::begin(gpu, "", splats, &scene.seeder, params)];
         if let Some(RunningTrial { other, .. }) = self.trials.running_trial() {
             let params = (&other.cameras.1, other.cameras.1.bytes());
@@ -264,6 +272,7 @@ impl SplatTrainer {
         trainer.optimizer.n_non_finite = state.n_non_finite.into();
         trainer.model.cameras.restore(gpu, &state.slots, state.model.params, checkpoint)?;
         trainer.trials.restore(state.remaining_trials, state.finished_trials);
+        trainer.growth_search.restore(state.growth_search);
         if let Some(trial) = state.trial {
             let n_planned_steps = trainer.options.common.n_planned_steps;
             trainer.trials.restore_trial(trial.restored(gpu, checkpoint, n_planned_steps, &arrivals)?);

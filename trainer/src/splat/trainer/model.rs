@@ -61,20 +61,19 @@ impl TrainedModel {
         Ok(())
     }
 
-    /// Replaces dead splats with children of other splats, then adds more children: a fraction `growth_frac` of the
-    /// splat count, up to the limit. `key` seeds the random choices.
+    /// Replaces dead splats with children of other splats, then adds up to `n_more` children, within the
+    /// limit. `key` seeds the random choices.
     pub(super) fn grow(
         &mut self,
         recorder: &mut Recorder,
         renderer: &mut Renderer,
         learn: &TrainPipelines,
-        growth_frac: f64,
+        n_more: u32,
         key: u32,
     ) -> Result<(), Error> {
         let n_before = self.splats.n_splats;
-        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "saturates, then limited")]
-        let n_more = if self.is_full { 0 } else { (f64::from(n_before) * growth_frac).ceil() as u32 };
-        let n_after = (n_before + n_more).min(self.max_splats).max(n_before);
+        let n_more = if self.is_full { 0 } else { n_more };
+        let n_after = n_before.saturating_add(n_more).min(self.max_splats).max(n_before);
         let n_after = self.reserve_up_to(recorder, renderer, n_after)?.max(n_before);
         let growth = Growth {
             n_before,

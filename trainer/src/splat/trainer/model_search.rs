@@ -19,12 +19,24 @@ impl SplatTrainer {
         }
     }
 
-    /// Starts, advances and ends trials until nothing is due, so that all effects of a trial's end apply at the same
-    /// step. Postponing them to the next submit would make training depend on timing.
+    /// Work that is due for trials. They wait for the end of a growth search.
+    fn due_trial(&self) -> Due {
+        match self.growth_search.running() {
+            Some(_) => Due::Nothing,
+            None => self.trials.due(self.trial_context()),
+        }
+    }
+
+    /// Starts, advances and ends trials and the growth search until nothing is due, so that all effects of
+    /// a trial's end apply at the same step. Postponing them to the next submit would make training depend on timing.
     pub(super) fn try_when_due(&mut self) -> Result<(), Error> {
-        while self.trials.due(self.trial_context()) != Due::Nothing {
+        while self.is_growth_search_due() || self.due_trial() != Due::Nothing {
             self.finish_in_flight()?; // A failed submit may reduce the step count.
-            match self.trials.due(self.trial_context()) {
+            if self.is_growth_search_due() {
+                self.advance_growth_search()?;
+                continue;
+            }
+            match self.due_trial() {
                 Due::Nothing => {}
                 Due::Begin(candidate) => self.begin_trial(candidate)?,
                 Due::BeginSecondHalf => self.begin_second_half()?,
@@ -60,6 +72,7 @@ impl SplatTrainer {
         match candidate {
             Candidate::Cameras(params) => self.model.cameras.enable(params),
             Candidate::Halved { to, .. } => self.keep_most_contributing(to)?,
+            Candidate::Doubled { .. } => {} // Tested by the growth search.
             Candidate::ShDegree { to, .. } => self.lower_degree(to)?,
         }
         self.prepare_training()
@@ -89,15 +102,17 @@ impl SplatTrainer {
         deferred.into_iter().try_for_each(|keyframe| self.add_arrival(keyframe))
     }
 
-    /// Cancels a trial that is in its second half.
+    /// Cancels a growth search, or a trial that is in its second half.
     pub(super) fn cancel_trial(&mut self) -> Result<(), Error> {
+        self.abort_growth_search()?;
         let Some(canceled) = self.trials.cancel() else { return Ok(()) };
         log::info!("training stopped during a trial; saving the model without the tested change");
         self.end_trial(canceled)
     }
 
-    /// Ends a trial without a decision; it is repeated.
+    /// Ends a growth search or a trial without a decision; it is repeated.
     pub(super) fn abort_trial(&mut self) -> Result<(), Error> {
+        self.abort_growth_search()?;
         self.trials.abort().map_or(Ok(()), |aborted| self.end_trial(aborted))
     }
 
@@ -110,7 +125,7 @@ impl SplatTrainer {
         self.release_validation()
     }
 
-    fn release_validation(&mut self) -> Result<(), Error> {
+    pub(super) fn release_validation(&mut self) -> Result<(), Error> {
         let released: Vec<Arc<Keyframe>> = self.trials.finish();
         released.into_iter().try_for_each(|keyframe| self.add_view(keyframe))?;
         self.prepare_training()

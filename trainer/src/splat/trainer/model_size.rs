@@ -33,6 +33,7 @@ impl SplatTrainer {
             self.recorder.passes.clear(&image_buffers.upstream);
         }
         self.optimizer.set_n_splats(&self.recorder.gpu, n_splats);
+        self.optimizer.write_drop_frac(&self.recorder.gpu, 0.0);
         for (ix, view_ix) in sampled_views.iter().copied().enumerate() {
             if ix % VIEWS_AT_ONCE == 0 {
                 let next = sampled_views[ix..].iter().take(VIEWS_AT_ONCE).map(|view_ix| (*view_ix, 0)).collect();
@@ -121,7 +122,7 @@ mod tests {
     use crate::Method;
     use crate::eval::{PixelPair, psnr};
     use crate::gpu::{Gpu, GpuOptions};
-    use crate::splat::training_tests::{n_keyframes, options, request, test_psnr, train};
+    use crate::splat::training_tests::{n_keyframes, noisy, options, request, test_psnr, train};
     use crate::splat::trials::CountPolicy;
     use calibration::Candidate;
     use calibration::Trial;
@@ -203,23 +204,6 @@ mod tests {
             }
         }
         all
-    }
-
-    /// Adds noise of up to a quarter of the value range. No model can score much more than 21 dB on such images.
-    fn noisy(keyframes: &[Arc<Keyframe>]) -> Vec<Arc<Keyframe>> {
-        let noisy = |keyframe: &Arc<Keyframe>| {
-            let mut state = keyframe.stamp.0.cast_unsigned();
-            let mut rgba = keyframe.rgba_srgb.to_vec();
-            for pixel in rgba.chunks_exact_mut(4) {
-                for color in &mut pixel[..3] {
-                    state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-                    let noise = i16::try_from((state >> 33) % 129).unwrap() - 64;
-                    *color = u8::try_from((i16::from(*color) + noise).clamp(0, 255)).unwrap();
-                }
-            }
-            Arc::new(Keyframe { rgba_srgb: rgba.into(), ..keyframe.as_ref().clone() })
-        };
-        keyframes.iter().map(noisy).collect()
     }
 
     /// Noise hides the details, so a few splats with view-independent colors suffice.

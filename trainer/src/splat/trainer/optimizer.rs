@@ -8,15 +8,13 @@ use crate::Error;
 use crate::gpu::{Buffer, Gpu, Passes, PendingRead, f32_of};
 use crate::model_options::ModelOptions;
 use crate::splat::buffers::ImageBuffers;
+use crate::splat::few_images::Scarcity;
 use crate::splat::kernels::TrainPipelines;
 use crate::splat::options::SplatOptions;
 use crate::splat::params::{Rule, Supervision, status};
 use crate::splat::passes::{Target, ViewPasses};
 use crate::splat::views::Level;
 use crate::submits::Submits;
-
-/// Readings further than this from the rendered depth are treated as outliers.
-const DEPTH_CLIP_M: f64 = 0.2;
 
 /// Updates the model to match the training images.
 #[derive(Debug)]
@@ -57,20 +55,13 @@ impl Optimizer {
         options: &ModelOptions<SplatOptions>,
         pipelines: LazyPipelines,
     ) -> Result<Self, Error> {
-        let supervision = Supervision {
-            background_srgb: [0.0; 4],
-            dssim_frac: f32_of(options.specific.dssim_frac),
-            depth_weight: f32_of(options.specific.depth_per_m),
-            depth_clip_m: f32_of(DEPTH_CLIP_M),
-            random_background: f32_of(options.specific.random_background),
-        };
         Ok(Self {
             pipelines,
             submits: Submits::new(),
             image_buffers: None,
             status: gpu.storage_with("splat.train_status", &[0; 4 * status::LEN])?,
             rule: gpu.uniform_with("splat.rule", &<Rule as bytemuck::Zeroable>::zeroed()),
-            supervision: gpu.uniform_with("splat.supervision", &supervision),
+            supervision: gpu.uniform_with("splat.supervision", &<Supervision as bytemuck::Zeroable>::zeroed()),
             has_ssim: options.specific.dssim_frac > 0.0,
             n_non_finite: 0,
         })
@@ -79,6 +70,24 @@ impl Optimizer {
     /// Uploads the learning rates of the next steps.
     pub(super) fn write_rule(&self, gpu: &Gpu, rule: &Rule) {
         gpu.write(&self.rule, 0, bytemuck::bytes_of(rule));
+    }
+
+    /// Uploads the loss weights of the next steps.
+    pub(super) fn write_supervision(&self, gpu: &Gpu, options: &SplatOptions, scarcity: Scarcity, mean_srgb: [f32; 3]) {
+        let [red, green, blue] = scarcity.min_background_srgb(mean_srgb, options.random_background);
+        let supervision = Supervision {
+            background_srgb: [red, green, blue, 0.0],
+            dssim_frac: f32_of(options.dssim_frac),
+            depth_weight: f32_of(options.depth_per_m * scarcity.depth_weight()),
+            depth_clip_m: f32_of(scarcity.depth_clip_m()),
+            random_background: f32_of(options.random_background),
+        };
+        gpu.write(&self.supervision, 0, bytemuck::bytes_of(&supervision));
+    }
+
+    /// Sets the fraction of the splats that the next steps leave out.
+    pub(super) fn write_drop_frac(&self, gpu: &Gpu, drop_frac: f32) {
+        self.write_counter(gpu, status::DROP_FRAC, drop_frac.to_bits());
     }
 
     /// Sets the number of splats for the next passes.

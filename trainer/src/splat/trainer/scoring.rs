@@ -1,13 +1,13 @@
 //! Scores the model in training on validation images.
 
-use super::SplatTrainer;
 use super::products::{self, Products};
 use super::renderer::DrawnView;
 use super::view_set::VIEWS_AT_ONCE;
-use crate::Error;
+use super::{SplatTrainer, displayed};
 use crate::splat::params::Camera;
 use crate::splat::trials::Scores;
 use crate::splat::views::{Level, camera_of};
+use crate::{Error, Method};
 use calibration::{CalibratedCamera, CameraCorrection, interpolate};
 use keyframe::Keyframe;
 use std::collections::{BTreeMap, BTreeSet};
@@ -33,7 +33,8 @@ impl SplatTrainer {
         if rgba.len() != 4 * camera.size_px[0] as usize * camera.size_px[1] as usize {
             return Ok(None);
         }
-        let drawn = DrawnView { splats: self.trials.displayed(&self.model.splats), camera, background_srgb };
+        let drawn =
+            DrawnView { splats: displayed(&self.growth_search, &self.trials, &self.model), camera, background_srgb };
         let products = self.renderer.compare_with_upload(&mut self.recorder, drawn, &learn.score, rgba)?;
         products::psnr(&products).map(Some)
     }
@@ -113,21 +114,23 @@ impl SplatTrainer {
     /// Logarithms of the gains that best match the picture of a view to its uploaded image.
     fn gains_of(&mut self, view_ix: usize, corrections: &CameraCorrections) -> Result<[f64; 3], Error> {
         let learn = self.learn()?;
-        let camera = corrected_camera(corrections, self.views.keyframe(view_ix));
+        let (camera, background_srgb) =
+            (corrected_camera(corrections, self.views.keyframe(view_ix)), self.background_srgb());
         let (_, Level { image, .. }) = self.views.ready_level((view_ix, 0))?;
-        let drawn = DrawnView { splats: &self.model.splats, camera: &camera, background_srgb: [0.0; 3] };
+        let drawn = DrawnView { splats: &self.model.splats, camera: &camera, background_srgb };
         let products = self.renderer.compare(&mut self.recorder, drawn, &learn.score, image)?;
         Ok(products::log_gains(&products))
     }
 
     fn compare_validation(&mut self) -> Result<Vec<ScoredKeyframe>, Error> {
-        let (learn, corrections) = (self.learn()?, self.learned_corrections()?);
+        let (learn, corrections, background_srgb) =
+            (self.learn()?, self.learned_corrections()?, self.background_srgb());
         let mut compared = Vec::new();
         for id in self.trials.scored() {
             let Some(validation) = self.trials.validation(&id) else { continue }; // Removed in the meantime.
             let camera = corrected_camera(&corrections, &validation.keyframe);
             let image = validation.uploaded(&self.recorder.gpu)?;
-            let drawn = DrawnView { splats: &self.model.splats, camera: &camera, background_srgb: [0.0; 3] };
+            let drawn = DrawnView { splats: &self.model.splats, camera: &camera, background_srgb };
             let products = self.renderer.compare(&mut self.recorder, drawn, &learn.score, image)?;
             compared.push((validation.keyframe.clone(), products));
         }
@@ -136,7 +139,7 @@ impl SplatTrainer {
 
     /// Current corrections of each camera, including those of a running trial. They apply to keyframes that alignment
     /// has already corrected.
-    fn learned_corrections(&self) -> Result<CameraCorrections, Error> {
+    pub(super) fn learned_corrections(&self) -> Result<CameraCorrections, Error> {
         let cameras = &self.model.cameras;
         if cameras.set.is_empty() {
             return Ok(CameraCorrections::new());
@@ -146,7 +149,7 @@ impl SplatTrainer {
 }
 
 /// The camera of a keyframe with its corrections, for drawing.
-fn corrected_camera(corrections: &CameraCorrections, keyframe: &Keyframe) -> Camera {
+pub(super) fn corrected_camera(corrections: &CameraCorrections, keyframe: &Keyframe) -> Camera {
     let lens = corrections
         .get(keyframe.camera.as_ref())
         .map_or_else(|| CalibratedCamera::of(keyframe), |correction| correction.apply(keyframe));
@@ -193,7 +196,10 @@ mod tests {
         assert_eq!(scores.len(), validation.len());
         for ((id, score), keyframe) in scores.iter().zip(validation) {
             assert_eq!(id.1, keyframe.stamp);
-            let picture = trainer.render(&request(keyframe.world_from_camera)).unwrap();
+            let background_srgb = trainer.background_srgb();
+            assert!(background_srgb[0] > 0.1, "{background_srgb:?}");
+            let request = crate::RenderRequest { background_srgb, ..request(keyframe.world_from_camera) };
+            let picture = trainer.render(&request).unwrap();
             let pair = PixelPair::new(keyframe.size_px, &picture.rgba_srgb, &keyframe.rgba_srgb).unwrap();
             assert!((psnr(&pair).unwrap() - score).abs() < 1e-9);
         }

@@ -5,7 +5,8 @@ use super::learning_rates;
 use super::optimizer::StepContext;
 use super::recorder::Recorder;
 use crate::Error;
-use crate::gpu::PassTiming;
+use crate::gpu::{PassTiming, f32_of};
+use crate::splat::few_images::Scarcity;
 use crate::splat::kernels::TrainPipelines;
 use crate::splat::params::status;
 use std::time::Instant;
@@ -81,9 +82,20 @@ impl SplatTrainer {
             return Ok(()); // The submit failed; the change is due again once its steps are repeated.
         }
         self.schedule.last_growth_step = self.schedule.step;
-        let growth_frac = if self.trials.may_grow() { self.options.specific.growth_frac } else { 0.0 };
         let key = growth_key(self.options.common.seed, self.schedule.step);
-        self.model.grow(&mut self.recorder, &mut self.renderer, learn, growth_frac, key)
+        let n_new = self.n_new_splats();
+        self.model.grow(&mut self.recorder, &mut self.renderer, learn, n_new, key)
+    }
+
+    /// Number of splats to add at a change of the splat count.
+    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "saturates, then limited")]
+    fn n_new_splats(&self) -> u32 {
+        let n_splats = self.model.splats.n_splats;
+        if !self.trials.may_grow() || !self.growth_search.may_grow() {
+            return 0;
+        }
+        let n_new = (f64::from(n_splats) * self.options.specific.growth_frac).ceil() as u32;
+        n_new.min(self.growth_search.limit().saturating_sub(n_splats))
     }
 
     /// Number of steps of the next submit. The submit stays within its time limit and does not pass a step at which
@@ -94,6 +106,7 @@ impl SplatTrainer {
             .min(by_time.clamp(1, MAX_STEPS_PER_SUBMIT))
             .min(self.schedule.steps_to_next_change())
             .min(self.trials.steps_left(self.schedule.step))
+            .min(self.growth_search.steps_left(self.schedule.step))
     }
 
     /// Uploads the settings of the next steps.
@@ -104,7 +117,12 @@ impl SplatTrainer {
         }
         let n_splats = model.splats.n_splats;
         optimizer.set_n_splats(gpu, n_splats);
-        optimizer.write_rule(gpu, &learning_rates::rule(options, schedule, &seeding.scene, views.len(), n_splats));
+        let scarcity = Scarcity::of_images(self.n_images());
+        let drop_frac = scarcity.drop_frac(options.specific.drop_frac, schedule.completed_frac());
+        optimizer.write_drop_frac(gpu, f32_of(drop_frac));
+        optimizer.write_counter(gpu, status::DROP_SEED, growth_key(options.common.seed, 0));
+        optimizer.write_supervision(gpu, &options.specific, scarcity, views.mean_srgb());
+        optimizer.write_rule(gpu, &learning_rates::rule(options, schedule, &seeding.scene, views.n_active(), n_splats));
     }
 
     /// Uploads the missing images of the next `n` steps. On a GPU, prepares images of later steps as well, which keeps
@@ -150,6 +168,6 @@ impl SplatTrainer {
 
 /// Random seed for one change of the splat count.
 #[expect(clippy::cast_possible_truncation, reason = "bits of a hash")]
-fn growth_key(seed: u64, step: u64) -> u32 {
+pub(super) fn growth_key(seed: u64, step: u64) -> u32 {
     (step as u32).wrapping_mul(0x9e37_79b9) ^ seed as u32
 }

@@ -2,10 +2,11 @@
 
 use super::recorder::Recorder;
 use crate::Error;
-use crate::gpu::{Buffer, Gpu};
+use crate::gpu::{Buffer, Gpu, f32_of};
 use crate::model_options::ModelOptions;
 use crate::splat::camera_params::CameraParams;
 use crate::splat::options::SplatOptions;
+use crate::splat::trials::ImageId;
 use crate::splat::views::{self, Keep, Level, LevelImages, Order, TrainView};
 use keyframe::Keyframe;
 use rayon::prelude::*;
@@ -25,6 +26,8 @@ const SOFTWARE_COARSE_STEPS: [u64; 2] = [500, 4000];
 #[derive(Debug)]
 pub(super) struct ViewSet {
     views: Vec<TrainView>,
+    /// Indices of the views to train on.
+    active: Vec<usize>,
     order: Order,
     coarse_steps: [u64; 2],
     /// Maximum bytes of the views' images on the GPU, unless a submit needs more.
@@ -41,6 +44,7 @@ impl ViewSet {
     pub(super) fn new(options: &ModelOptions<SplatOptions>, is_software: bool) -> Self {
         Self {
             views: Vec::new(),
+            active: Vec::new(),
             order: Order::new(options.common.seed),
             coarse_steps: options.specific.coarse_steps.unwrap_or(if is_software {
                 SOFTWARE_COARSE_STEPS
@@ -73,17 +77,49 @@ impl ViewSet {
         &self.views[view_ix].keyframe
     }
 
+    /// Adds a view. Training visits it, too.
     pub(super) fn push(&mut self, keyframe: Arc<Keyframe>) {
+        self.active.push(self.views.len());
         self.views.push(TrainView::new(keyframe));
+    }
+
+    /// Mean color of the images, sRGB; black without images.
+    pub(super) fn mean_srgb(&self) -> [f32; 3] {
+        let known: Vec<[f64; 3]> = self.views.iter().filter_map(TrainView::mean_srgb).collect();
+        let mean = |color: usize| known.iter().map(|image| image[color]).sum::<f64>() / known.len().max(1) as f64;
+        [0, 1, 2].map(|color| f32_of(mean(color)))
+    }
+
+    /// Number of views to train on.
+    pub(super) fn n_active(&self) -> usize {
+        self.active.len()
+    }
+
+    /// The keyframes to train on.
+    pub(super) fn active_keyframes(&self) -> impl Iterator<Item = &Arc<Keyframe>> {
+        self.active.iter().map(|ix| &self.views[*ix].keyframe)
+    }
+
+    /// Trains on all views except these images.
+    pub(super) fn hold_out(&mut self, images: &[ImageId]) {
+        let held_out: BTreeSet<usize> = images.iter().filter_map(|image| self.position(image)).collect();
+        self.active = (0..self.views.len()).filter(|ix| !held_out.contains(ix)).collect();
+    }
+
+    /// Index of the view of an image.
+    pub(super) fn position(&self, (camera, stamp): &ImageId) -> Option<usize> {
+        self.keyframes().position(|keyframe| keyframe.camera == *camera && keyframe.stamp == *stamp)
     }
 
     pub(super) fn retain(&mut self, is_kept: impl Fn(&Arc<Keyframe>) -> bool) {
         self.views.retain(|view| is_kept(&view.keyframe));
+        self.hold_out(&[]);
     }
 
     /// Replaces all views.
     pub(super) fn replace(&mut self, keyframes: impl IntoIterator<Item = Arc<Keyframe>>) {
         self.views = keyframes.into_iter().map(TrainView::new).collect();
+        self.hold_out(&[]);
     }
 
     /// Replaces the cameras of all views; `correct` replaces a keyframe. Uploaded images are kept where possible.
@@ -107,7 +143,7 @@ impl ViewSet {
 
     /// The view and level that a step trains on.
     pub(super) fn of_step(&mut self, step: u64) -> ViewLevel {
-        let view_ix = self.order.pick(step, self.views.len());
+        let view_ix = self.active[self.order.pick(step, self.active.len())];
         (view_ix, self.views[view_ix].clamped(level_at(step, self.coarse_steps)))
     }
 

@@ -1,0 +1,85 @@
+//! Regularization of models of few images. It fades out as the number of images rises, because it costs detail if there
+//! are many images.
+
+use super::growth_search::FEW_IMAGES;
+use crate::gpu::f32_of;
+
+/// Up to this number of images, the regularization is complete.
+const VERY_FEW_IMAGES: usize = 20;
+/// Completed fraction of the planned steps from which on splats are dropped at the full rate. Earlier, dropping would
+/// only slow down training.
+const DROP_RAMP_FRAC: f64 = 0.2;
+/// Depth residuals above this limit have no gradient.
+const DEPTH_CLIP_M: f64 = 0.2;
+/// The same for few images. Splats in front of the surface are further from it than [`DEPTH_CLIP_M`]. Many images show
+/// them to be wrong; with few images, only depth does.
+const FEW_DEPTH_CLIP_M: f64 = 1.0;
+/// Weight of the depth loss for few images, relative to the usual weight.
+const FEW_DEPTH_WEIGHT: f64 = 3.0;
+
+/// How much regularization a model needs: 0 to 1.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Scarcity(f64);
+
+impl Scarcity {
+    /// Scarcity of `n` training images.
+    pub(crate) fn of_images(n: usize) -> Self {
+        let missing = FEW_IMAGES.saturating_sub(n) as f64 / (FEW_IMAGES - VERY_FEW_IMAGES) as f64;
+        Self(missing.min(1.0))
+    }
+
+    /// Fraction of the splats that a step leaves out, given its maximum (Park et al. 2025, `DropGaussian`).
+    pub(crate) fn drop_frac(self, max: f64, completed_frac: f64) -> f64 {
+        self.0 * max * (completed_frac / DROP_RAMP_FRAC).min(1.0)
+    }
+
+    /// Depth residuals above this limit have no gradient, meters.
+    pub(crate) fn depth_clip_m(self) -> f64 {
+        self.between(DEPTH_CLIP_M, FEW_DEPTH_CLIP_M)
+    }
+
+    /// Factor of the weight of the depth loss.
+    pub(crate) fn depth_weight(self) -> f64 {
+        self.between(1.0, FEW_DEPTH_WEIGHT)
+    }
+
+    /// Background of pictures, given the mean color of the images: the expected color of what no image shows. Black if
+    /// there are many images.
+    pub(crate) fn background_srgb(self, mean_srgb: [f32; 3]) -> [f32; 3] {
+        mean_srgb.map(|color| f32_of(self.0) * color)
+    }
+
+    /// Smallest color of the random background during training. If possible, it varies by up to `range` around the
+    /// background of pictures, and otherwise from black.
+    pub(crate) fn min_background_srgb(self, mean_srgb: [f32; 3], range: f64) -> [f32; 3] {
+        mean_srgb.map(|color| f32_of(self.0 * (f64::from(color) - 0.5 * range).clamp(0.0, (1.0 - range).max(0.0))))
+    }
+
+    fn between(self, many: f64, few: f64) -> f64 {
+        many + self.0 * (few - many)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn regularization_fades_with_the_number_of_images() {
+        let drop_frac = |n| Scarcity::of_images(n).drop_frac(0.2, 0.5);
+        assert_eq!([1, 20, 40, 300].map(drop_frac), [0.2, 0.2, 0.0, 0.0]);
+        assert!((drop_frac(30) - 0.1).abs() < 1e-12);
+        assert_eq!(Scarcity::of_images(5).drop_frac(0.2, 0.0), 0.0, "no splats are dropped at the start");
+        let background = |n, color| {
+            let scarcity = Scarcity::of_images(n);
+            (scarcity.background_srgb([color; 3])[0], scarcity.min_background_srgb([color; 3], 0.25)[0])
+        };
+        assert_eq!(
+            [background(8, 0.5), background(8, 0.0), background(8, 1.0)],
+            [(0.5, 0.375), (0.0, 0.0), (1.0, 0.75)]
+        );
+        assert_eq!(background(40, 0.5), (0.0, 0.0));
+        let depth = |n| (Scarcity::of_images(n).depth_clip_m(), Scarcity::of_images(n).depth_weight());
+        assert_eq!((depth(40), depth(8)), ((DEPTH_CLIP_M, 1.0), (FEW_DEPTH_CLIP_M, FEW_DEPTH_WEIGHT)));
+    }
+}

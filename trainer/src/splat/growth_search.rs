@@ -1,0 +1,253 @@
+//! Cross-validation that limits the number of splats if there are few images.
+//!
+//! A few images do not determine many splats: beyond some number, the scores of other views fall while those of the
+//! training images still rise. Too few images can be excluded from training to measure this, so the images are divided
+//! into folds instead. For each fold, a model is trained from the start on the images of the other folds. It is then
+//! trained further with the same and with twice the number of splats, and both are scored on the images of the fold. If
+//! twice the number scores better on average, the models with twice the number are doubled again. The model that is
+//! trained on all images waits until its limit is known.
+
+use super::snapshot::Snapshot;
+use super::trials::ImageId;
+use calibration::{Candidate, Trial};
+use serde::{Deserialize, Serialize};
+
+/// From this number of images on, the number of splats is not limited.
+pub(crate) const FEW_IMAGES: usize = 40;
+/// Step of the search. Before this step, the models are too coarse for a decision.
+pub(crate) const SEARCH_START: u64 = 800;
+/// Maximum number of steps before the first comparison.
+pub(crate) const MAX_WARM_UP: u64 = 2 * SEARCH_START;
+/// Steps with the same and with twice the number of splats.
+pub(crate) const COMPARED_STEPS: u64 = 250;
+/// Maximum number of folds.
+const MAX_FOLDS: usize = 3;
+/// Growth of the number of images that makes a new search necessary.
+const NEW_SEARCH_GROWTH: f64 = 1.25;
+
+/// State of the search.
+#[derive(Debug)]
+pub(crate) enum GrowthSearch {
+    /// The number of splats is not limited.
+    Off,
+    /// The search starts at [`SEARCH_START`].
+    Waiting,
+    Running(Box<FoldModels>),
+    Finished(GrowthLimit),
+}
+
+/// Result of a search.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct GrowthLimit {
+    /// Maximum number of splats.
+    pub(crate) n_splats: u32,
+    /// Number of images that the search used.
+    pub(crate) n_images: usize,
+}
+
+/// The search in a checkpoint. A running search is repeated.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct SavedGrowthSearch {
+    limit: Option<GrowthLimit>,
+}
+
+/// The models of a running search.
+#[derive(Debug)]
+pub(crate) struct FoldModels {
+    /// The model that is trained on all images.
+    pub(crate) main: Snapshot,
+    /// The images of each fold.
+    pub(crate) folds: Vec<Vec<ImageId>>,
+    /// The fold whose images are excluded from the model in training.
+    pub(crate) fold_ix: usize,
+    pub(crate) phase: FoldPhase,
+    /// Last step of this phase.
+    pub(crate) until: u64,
+    /// Number of splats with which a doubled number is compared; the number in `main`, doubled in each earlier round.
+    pub(crate) n_splats: u32,
+    /// The model before its number of splats is doubled.
+    pub(crate) fork: Option<Snapshot>,
+    /// Results of the previous round for the remaining folds, in order.
+    pub(crate) previous: std::collections::VecDeque<Snapshot>,
+    /// Models with twice the number of splats.
+    pub(crate) doubled: std::collections::VecDeque<Snapshot>,
+    pub(crate) baseline: Vec<HeldOutScore>,
+    pub(crate) variant: Vec<HeldOutScore>,
+    /// Results of the finished rounds.
+    pub(crate) trials: Vec<Trial>,
+}
+
+/// What the model of a fold is trained for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum FoldPhase {
+    /// Training from the start.
+    WarmUp,
+    /// Training with the same number of splats.
+    Baseline,
+    /// Training with twice the number of splats.
+    Variant,
+}
+
+/// Score of an image that was excluded from training.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct HeldOutScore {
+    /// `None` if the image is fully masked.
+    pub(crate) psnr_db: Option<f64>,
+    /// `None` without measured depth, or where none is rendered.
+    pub(crate) depth_rmse_m: Option<f64>,
+}
+
+impl GrowthSearch {
+    pub(crate) fn new(is_tested: bool) -> Self {
+        if is_tested { Self::Waiting } else { Self::Off }
+    }
+
+    /// The running search.
+    pub(crate) fn running(&self) -> Option<&FoldModels> {
+        if let Self::Running(models) = self { Some(models) } else { None }
+    }
+
+    /// The running search.
+    pub(crate) fn running_mut(&mut self) -> Option<&mut FoldModels> {
+        if let Self::Running(models) = self { Some(models) } else { None }
+    }
+
+    /// Ends the running search without a result, so that it is repeated. Returns its models.
+    pub(crate) fn abort(&mut self) -> Option<Box<FoldModels>> {
+        match std::mem::replace(self, Self::Waiting) {
+            Self::Running(models) => Some(models),
+            other => {
+                *self = other;
+                None
+            }
+        }
+    }
+
+    /// Whether splats may be added at the regular changes of their number.
+    pub(crate) fn may_grow(&self) -> bool {
+        self.running().is_none_or(|models| models.phase == FoldPhase::WarmUp)
+    }
+
+    /// Maximum number of splats.
+    pub(crate) fn limit(&self) -> u32 {
+        if let Self::Finished(limit) = self { limit.n_splats } else { u32::MAX }
+    }
+
+    /// Steps until the phase of a running search ends, or until a search may start.
+    pub(crate) fn steps_left(&self, step: u64) -> u64 {
+        match self {
+            Self::Waiting if step < SEARCH_START => SEARCH_START - step,
+            Self::Running(models) => models.until.saturating_sub(step).max(1),
+            _ => u64::MAX,
+        }
+    }
+
+    /// Adapts to a changed number of images. With many images, or with many more than the search used, its limit is no
+    /// longer valid.
+    pub(crate) fn set_n_images(&mut self, n_images: usize) {
+        if let Self::Finished(limit) = self
+            && (n_images >= FEW_IMAGES || n_images as f64 >= NEW_SEARCH_GROWTH * limit.n_images as f64)
+        {
+            *self = Self::Waiting;
+        }
+    }
+
+    /// State for a checkpoint.
+    pub(crate) fn saved(&self) -> SavedGrowthSearch {
+        SavedGrowthSearch { limit: if let Self::Finished(limit) = self { Some(*limit) } else { None } }
+    }
+
+    /// Restores the state from a checkpoint.
+    pub(crate) fn restore(&mut self, saved: SavedGrowthSearch) {
+        if let Some(limit) = saved.limit {
+            *self = Self::Finished(limit);
+        }
+    }
+}
+
+/// Divides images into folds. Consecutive images are in different folds, because an image is predicted from its
+/// neighbors.
+pub(crate) fn folds(images: Vec<ImageId>) -> Vec<Vec<ImageId>> {
+    let n_folds = images.len().min(MAX_FOLDS);
+    let mut folds = vec![Vec::new(); n_folds];
+    for (ix, image) in images.into_iter().enumerate() {
+        folds[ix % n_folds].push(image);
+    }
+    folds
+}
+
+/// Decides whether to double the number of splats: the mean PSNR must gain more than 0.1 dB beyond one standard error, and
+/// the mean depth error must not rise by more than its standard error.
+pub(crate) fn doubling_trial(candidate: Candidate, baseline: &[HeldOutScore], variant: &[HeldOutScore]) -> Trial {
+    let pairs = || baseline.iter().zip(variant);
+    let gains = pairs().filter_map(|(baseline, variant)| Some(variant.psnr_db? - baseline.psnr_db?));
+    let rises = pairs().filter_map(|(baseline, variant)| Some(variant.depth_rmse_m? - baseline.depth_rmse_m?));
+    let mut trial = Trial::of_gains(candidate, &gains.collect::<Vec<f64>>());
+    let (rise_m, error_m) = mean_and_standard_error(&rises.collect::<Vec<f64>>());
+    trial.kept &= rise_m <= error_m;
+    log::info!("{candidate}: depth error {:+.1} mm (standard error {:.1})", 1e3 * rise_m, 1e3 * error_m);
+    trial
+}
+
+fn mean_and_standard_error(values: &[f64]) -> (f64, f64) {
+    let n = values.len().max(1) as f64;
+    let mean = values.iter().sum::<f64>() / n;
+    let variance = values.iter().map(|value| (value - mean).powi(2)).sum::<f64>() / f64::max(n - 1.0, 1.0);
+    (mean, (variance / n).sqrt())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use kinematics::Stamp;
+
+    const DOUBLED: Candidate = Candidate::Doubled { from: 1000, to: 2000 };
+
+    fn scores(psnr_db: [f64; 4], depth_rmse_m: [f64; 4]) -> Vec<HeldOutScore> {
+        let score = |(psnr_db, depth_rmse_m)| HeldOutScore { psnr_db: Some(psnr_db), depth_rmse_m: Some(depth_rmse_m) };
+        psnr_db.into_iter().zip(depth_rmse_m).map(score).collect()
+    }
+
+    #[test]
+    fn doubling_needs_better_images_and_no_worse_depth() {
+        let before = scores([20.0, 22.0, 18.0, 21.0], [0.10, 0.12, 0.09, 0.11]);
+        let kept = |psnr_db, depth_rmse_m| doubling_trial(DOUBLED, &before, &scores(psnr_db, depth_rmse_m)).kept;
+        let same_depth = [0.10, 0.12, 0.09, 0.11];
+        assert!(kept([20.4, 22.5, 18.4, 21.3], same_depth));
+        assert!(kept([20.4, 22.5, 18.4, 21.3], [0.09, 0.13, 0.09, 0.11]), "within the standard error");
+        assert!(!kept([20.4, 22.5, 18.4, 21.3], [0.12, 0.14, 0.10, 0.13]), "the depth error rises");
+        assert!(!kept([20.09, 22.08, 18.09, 21.08], same_depth), "less than 0.1 dB");
+        assert!(!kept([21.0, 22.0, 18.0, 20.7], same_depth), "not beyond the standard error");
+    }
+
+    #[test]
+    fn images_without_depth_are_judged_by_color() {
+        let score = |psnr_db| vec![HeldOutScore { psnr_db: Some(psnr_db), depth_rmse_m: None }; 3];
+        assert!(doubling_trial(DOUBLED, &score(20.0), &score(20.3)).kept);
+        let masked = vec![HeldOutScore { psnr_db: None, depth_rmse_m: None }; 3];
+        assert!(!doubling_trial(DOUBLED, &masked, &masked).kept);
+    }
+
+    #[test]
+    fn every_image_is_in_one_fold() {
+        let images = |n: i64| (0..n).map(|ix| ("camera".into(), Stamp(ix))).collect::<Vec<ImageId>>();
+        let sizes = |n| folds(images(n)).iter().map(Vec::len).collect::<Vec<usize>>();
+        assert_eq!((sizes(11), sizes(2), sizes(0)), (vec![4, 4, 3], vec![1, 1], vec![]));
+        let all: std::collections::BTreeSet<ImageId> = folds(images(11)).into_iter().flatten().collect();
+        assert_eq!(all.len(), 11);
+        assert!(folds(images(11)).iter().all(|fold| fold.windows(2).all(|pair| pair[1].1.0 - pair[0].1.0 > 1)));
+    }
+
+    #[test]
+    fn limit_expires_with_more_images() {
+        let limit = GrowthLimit { n_splats: 500, n_images: 10 };
+        let after = |n_images| {
+            let mut search = GrowthSearch::Finished(limit);
+            search.set_n_images(n_images);
+            search.limit()
+        };
+        assert_eq!([11, 12, 13, FEW_IMAGES].map(after), [500, 500, u32::MAX, u32::MAX]);
+    }
+}

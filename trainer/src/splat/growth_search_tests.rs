@@ -1,0 +1,135 @@
+//! Tests of the growth search: few images limit the number of splats, many images do not, and interruptions of a search
+//! have no effect.
+
+use super::growth_search::{FEW_IMAGES, SEARCH_START};
+use super::training_tests::{n_keyframes, noisy, options, train};
+use super::trials::CountPolicy;
+use super::{SplatOptions, SplatTrainer};
+use crate::Method;
+use crate::checkpoint::Checkpoint;
+use crate::gpu::{Gpu, GpuOptions};
+use crate::model_options::ModelOptions;
+use calibration::{Candidate, Trial};
+use keyframe::{Keyframe, Split};
+use std::sync::Arc;
+
+const N_PLANNED_STEPS: u64 = 1600;
+
+fn tested() -> ModelOptions<SplatOptions> {
+    options().with(|options| {
+        options.common.n_planned_steps = N_PLANNED_STEPS;
+        options.specific.count = CountPolicy::Tested;
+        options.specific.max_splats = 8000;
+    })
+}
+
+fn new_trainer(gpu: &Arc<Gpu>, options: ModelOptions<SplatOptions>, keyframes: &[Arc<Keyframe>]) -> SplatTrainer {
+    let mut trainer = SplatTrainer::new(gpu.clone(), options).unwrap();
+    keyframes.iter().for_each(|keyframe| trainer.push(keyframe.clone()).unwrap());
+    trainer
+}
+
+/// Keyframes without validation keyframes, whose late use as training keyframes would add splats.
+fn without_validation(keyframes: Vec<Arc<Keyframe>>) -> Vec<Arc<Keyframe>> {
+    let train = |keyframe: Arc<Keyframe>| match keyframe.split {
+        Split::Validation => Arc::new(Keyframe { split: Split::Train, ..keyframe.as_ref().clone() }),
+        Split::Train | Split::Test => keyframe,
+    };
+    keyframes.into_iter().map(train).collect()
+}
+
+fn doublings(trainer: &SplatTrainer) -> Vec<Trial> {
+    let is_doubling = |trial: &&Trial| matches!(trial.candidate, Candidate::Doubled { .. });
+    trainer.trials().iter().filter(is_doubling).cloned().collect()
+}
+
+fn checkpoint_of(trainer: &mut SplatTrainer) -> Checkpoint {
+    trainer.checkpoint().unwrap().finish().unwrap()
+}
+
+/// The images are noisy, so more splats represent the noise of the training images.
+#[test]
+fn few_noisy_images_stop_growth() {
+    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let keyframes = without_validation(noisy(&n_keyframes(&gpu, 9, true)));
+    let n_images = keyframes.iter().filter(|keyframe| keyframe.split != Split::Test).count();
+    let mut trainer = new_trainer(&gpu, tested(), &keyframes);
+    train(&mut trainer, SEARCH_START);
+    let n_before = trainer.progress().primitives;
+    train(&mut trainer, 10);
+    let reported = doublings(&trainer);
+    let [Trial { gain_db, n_images: n_scored, kept: false, .. }] = reported[..] else { panic!("{reported:?}") };
+    assert!(gain_db < 0.1 && n_scored == n_images, "every image is scored once: {reported:?}");
+    train(&mut trainer, N_PLANNED_STEPS - SEARCH_START - 10);
+    assert_eq!((trainer.progress().primitives, trainer.n_active_views()), (n_before, n_images));
+    let mut unlimited =
+        new_trainer(&gpu, tested().with(|options| options.specific.count = CountPolicy::ToCap), &keyframes);
+    train(&mut unlimited, N_PLANNED_STEPS);
+    assert!(unlimited.progress().primitives > n_before, "{:?}", unlimited.progress());
+}
+
+/// Without noise, a model with much fewer splats than the scene has details improves if it grows.
+#[test]
+fn useful_growth_continues() {
+    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let keyframes = without_validation(n_keyframes(&gpu, 28, true));
+    let options = tested().with(|options| options.specific.seeds_per_image = Some(60.0));
+    let mut trainer = new_trainer(&gpu, options, &keyframes);
+    train(&mut trainer, SEARCH_START);
+    let n_before = trainer.progress().primitives;
+    assert!(n_before < 3000, "{n_before}");
+    train(&mut trainer, 300);
+    let reported = doublings(&trainer);
+    assert!(reported[0].kept && reported[0].gain_db > 0.1, "{reported:?}");
+    assert!(trainer.progress().primitives > n_before, "{:?}", trainer.progress());
+}
+
+#[test]
+fn many_images_are_not_tested() {
+    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let keyframes = noisy(&n_keyframes(&gpu, 8 * FEW_IMAGES / 7 + 1, true));
+    let options = tested().with(|options| options.specific.max_splats = 3000);
+    let mut trainer = new_trainer(&gpu, options, &keyframes);
+    train(&mut trainer, SEARCH_START + 20);
+    assert!(trainer.trials().is_empty() && !trainer.is_growth_search_running() && trainer.growth_limit().is_none());
+    assert_eq!(trainer.n_total_steps().unwrap(), SEARCH_START + 20);
+}
+
+/// A keyframe that arrives during a search restarts it. A checkpoint continues with the same result.
+#[test]
+fn interrupted_search_is_repeated() {
+    const END: u64 = SEARCH_START + 50;
+    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let keyframes = without_validation(n_keyframes(&gpu, 12, true));
+    let start_search = || {
+        let mut trainer = new_trainer(&gpu, tested(), &keyframes[..11]);
+        train(&mut trainer, SEARCH_START);
+        let n_before = trainer.progress().primitives;
+        trainer.step(30).unwrap();
+        assert!(trainer.is_growth_search_running());
+        assert_eq!((trainer.progress().step, trainer.progress().primitives), (SEARCH_START, n_before), "not displayed");
+        trainer
+    };
+    let finish = |trainer: &mut SplatTrainer| {
+        trainer.push(keyframes[11].clone()).unwrap();
+        assert!(!trainer.is_growth_search_running());
+        let n_left = END - trainer.progress().step;
+        train(trainer, n_left);
+        assert_eq!(doublings(trainer).len(), 1, "{:?}", trainer.trials());
+        checkpoint_of(trainer)
+    };
+    let mut uninterrupted = start_search();
+    let checkpoint = checkpoint_of(&mut uninterrupted);
+    assert!(uninterrupted.is_growth_search_running());
+    let (mut resumed, untrained) = SplatTrainer::resume(gpu.clone(), &checkpoint, &keyframes[..11]).unwrap();
+    untrained.into_iter().for_each(|keyframe| resumed.push(keyframe).unwrap());
+    let (one, other) = (finish(&mut uninterrupted), finish(&mut resumed));
+    assert_eq!(one.state, other.state);
+    assert!(one.arrays == other.arrays, "the models differ");
+    // A saved model is the model that is trained on all images.
+    let mut saved = start_search();
+    let n_before = saved.progress().primitives;
+    saved.save(tempfile::tempdir().unwrap().path()).unwrap();
+    assert_eq!(saved.arrays().unwrap().n_splats() as u64, n_before);
+    assert_eq!((saved.progress().step, saved.n_total_steps().unwrap() > SEARCH_START), (SEARCH_START, true));
+}

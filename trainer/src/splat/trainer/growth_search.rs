@@ -1,0 +1,259 @@
+//! Runs the cross-validation that limits the number of splats if there are few images.
+
+use super::SplatTrainer;
+use super::renderer::DrawnView;
+use super::scoring::corrected_camera;
+use super::training::growth_key;
+use super::{products, view_set};
+use crate::eval::depth_rmse_m;
+use crate::packing::Output;
+use crate::splat::buffers::SplatBuffers;
+use crate::splat::growth_search::{
+    COMPARED_STEPS, FEW_IMAGES, FoldModels, FoldPhase, GrowthLimit, GrowthSearch, HeldOutScore, MAX_WARM_UP,
+    SEARCH_START, doubling_trial, folds,
+};
+use crate::splat::schedule::Schedule;
+use crate::splat::snapshot::{ObservedScene, Snapshot};
+use crate::splat::trials::ImageId;
+use crate::splat::views::Level;
+use crate::view::depth_in_color_view;
+use crate::{Error, Method};
+use calibration::{Candidate, MIN_VALIDATION_IMAGES};
+use std::collections::VecDeque;
+
+impl SplatTrainer {
+    /// Number of images that the model is trained on in the end. Both halves of a trial have the same number at each step,
+    /// so validation images that arrive during a trial do not count.
+    pub(super) fn n_images(&self) -> usize {
+        let n_validation = match self.trials.running_trial() {
+            Some(trial) => trial.scored.len(),
+            None => self.trials.validation.len(),
+        };
+        self.views.len() + n_validation
+    }
+
+    /// Whether the search must start or a phase of it has ended.
+    pub(super) fn is_growth_search_due(&self) -> bool {
+        match &self.growth_search {
+            GrowthSearch::Running(models) => self.schedule.step >= models.until,
+            GrowthSearch::Waiting => {
+                self.schedule.step >= SEARCH_START
+                    && !self.schedule.is_mature()
+                    && self.trials.running_trial().is_none()
+                    && self.model.splats.n_splats < self.options.cap()
+                    && (2..FEW_IMAGES).contains(&self.n_images())
+            }
+            GrowthSearch::Off | GrowthSearch::Finished(_) => false,
+        }
+    }
+
+    /// Starts the search or its next phase. If GPU memory is insufficient, the search ends without a limit.
+    pub(super) fn advance_growth_search(&mut self) -> Result<(), Error> {
+        let advanced = match self.growth_search.running().map(|models| models.phase) {
+            None => self.begin_growth_search(),
+            Some(FoldPhase::WarmUp) => self.begin_fold_baseline(),
+            Some(FoldPhase::Baseline) => self.begin_fold_variant(),
+            Some(FoldPhase::Variant) => self.end_fold_variant(),
+        };
+        match advanced {
+            Err(error) if error.is_out_of_memory() => {
+                log::warn!("stopped testing the number of splats: {error}");
+                self.abort_growth_search()?;
+                self.growth_search = GrowthSearch::Off;
+                Ok(())
+            }
+            other => other,
+        }
+    }
+
+    /// Restores the model that is trained on all images, if a search is running. The search is repeated.
+    pub(super) fn abort_growth_search(&mut self) -> Result<(), Error> {
+        let Some(models) = self.growth_search.abort() else { return Ok(()) };
+        self.views.hold_out(&[]);
+        self.restore_snapshot(models.main)
+    }
+
+    fn begin_growth_search(&mut self) -> Result<(), Error> {
+        if self.trials.validation.len() < MIN_VALIDATION_IMAGES && self.trials.holds_validation() {
+            self.release_validation()?; // Too few for trials, but useful for training.
+        }
+        let folds = folds(self.views.keyframes().map(|keyframe| (keyframe.camera.clone(), keyframe.stamp)).collect());
+        let n_splats = self.model.splats.n_splats;
+        let until = self.schedule.step;
+        let main = self.take_state()?;
+        self.growth_search = GrowthSearch::Running(Box::new(FoldModels {
+            main,
+            folds,
+            fold_ix: 0,
+            phase: FoldPhase::WarmUp,
+            until,
+            n_splats,
+            fork: None,
+            previous: VecDeque::new(),
+            doubled: VecDeque::new(),
+            baseline: Vec::new(),
+            variant: Vec::new(),
+            trials: Vec::new(),
+        }));
+        self.begin_fold()
+    }
+
+    /// Starts the model of the current fold, or continues the model of the previous round.
+    fn begin_fold(&mut self) -> Result<(), Error> {
+        let Some(models) = self.growth_search.running_mut() else { return Ok(()) };
+        self.views.hold_out(&models.folds[models.fold_ix]);
+        if let Some(previous) = models.previous.pop_front() {
+            self.restore_snapshot(previous)?;
+            return self.begin_fold_baseline();
+        }
+        models.phase = FoldPhase::WarmUp;
+        models.until = models.main.schedule.step.min(MAX_WARM_UP);
+        let (set, params) = &models.main.cameras;
+        let gpu = &self.recorder.gpu;
+        let copy = gpu.storage("splat.camera_params", params.bytes())?;
+        gpu.copy((params, 0), (&copy, 0), params.bytes());
+        let untrained = Snapshot {
+            splats: SplatBuffers::new(gpu, 1, models.main.splats.sh_degree)?,
+            cameras: (*set, copy),
+            schedule: Schedule::new(self.schedule.n_planned_steps),
+            scene: ObservedScene::default(),
+        };
+        self.restore_snapshot(untrained)?;
+        self.views.active_keyframes().cloned().for_each(|keyframe| self.seeding.push(keyframe));
+        self.prepare_training()
+    }
+
+    /// Trains the model of the current fold with the same number of splats.
+    fn begin_fold_baseline(&mut self) -> Result<(), Error> {
+        let fork = self.snapshot()?;
+        let step = self.schedule.step;
+        if let Some(models) = self.growth_search.running_mut() {
+            models.fork = Some(fork);
+            (models.phase, models.until) = (FoldPhase::Baseline, step + COMPARED_STEPS);
+        }
+        Ok(())
+    }
+
+    /// Scores the model of the current fold, and trains it with twice the number of splats.
+    fn begin_fold_variant(&mut self) -> Result<(), Error> {
+        let scores = self.score_held_out()?;
+        let Some(models) = self.growth_search.running_mut() else { return Ok(()) };
+        models.baseline.extend(scores);
+        models.phase = FoldPhase::Variant;
+        if let Some(fork) = models.fork.take() {
+            self.restore_snapshot(fork)?;
+        }
+        let learn = self.learn()?;
+        let (n_more, step) = (self.model.splats.n_splats, self.schedule.step);
+        self.schedule.last_growth_step = step;
+        let key = growth_key(self.options.common.seed, step);
+        self.model.grow(&mut self.recorder, &mut self.renderer, &learn, n_more, key)
+    }
+
+    /// Scores the model with twice the number of splats. Continues with the next fold, or decides.
+    fn end_fold_variant(&mut self) -> Result<(), Error> {
+        let scores = self.score_held_out()?;
+        let state = self.take_state()?;
+        let Some(models) = self.growth_search.running_mut() else { return Ok(()) };
+        models.variant.extend(scores);
+        models.doubled.push_back(state);
+        models.fold_ix += 1;
+        if models.fold_ix < models.folds.len() {
+            return self.begin_fold();
+        }
+        let cap = self.options.cap();
+        let to = models.n_splats.saturating_mul(2).min(cap);
+        let candidate = Candidate::Doubled { from: models.n_splats, to };
+        let trial = doubling_trial(candidate, &models.baseline, &models.variant);
+        trial.log_result();
+        if trial.kept {
+            models.n_splats = to;
+        }
+        let continues = trial.kept && to < cap;
+        models.trials.push(trial);
+        if continues {
+            models.fold_ix = 0;
+            models.previous = std::mem::take(&mut models.doubled);
+            models.baseline.clear();
+            models.variant.clear();
+            return self.begin_fold();
+        }
+        self.trials.finished.append(&mut models.trials);
+        let limit = GrowthLimit { n_splats: models.n_splats, n_images: self.n_images() };
+        self.abort_growth_search()?;
+        self.growth_search = GrowthSearch::Finished(limit);
+        Ok(())
+    }
+
+    /// Moves the current state out. It must be replaced before training continues.
+    fn take_state(&mut self) -> Result<Snapshot, Error> {
+        self.recorder.passes.clear_bindings();
+        let gpu = &self.recorder.gpu;
+        let empty = SplatBuffers::new(gpu, 1, self.model.splats.sh_degree)?;
+        let cameras = (self.model.cameras.set, self.model.cameras.copy(gpu)?);
+        Ok(Snapshot {
+            splats: std::mem::replace(&mut self.model.splats, empty),
+            cameras,
+            schedule: self.schedule,
+            scene: self.seeding.scene.clone(),
+        })
+    }
+
+    /// Scores the images of the current fold.
+    fn score_held_out(&mut self) -> Result<Vec<HeldOutScore>, Error> {
+        let (learn, corrections, background_srgb) =
+            (self.learn()?, self.learned_corrections()?, self.background_srgb());
+        let held_out: Vec<ImageId> =
+            self.growth_search.running().map(|models| models.folds[models.fold_ix].clone()).unwrap_or_default();
+        let view_ixs: Vec<usize> = held_out.iter().filter_map(|image| self.views.position(image)).collect();
+        let mut scores = Vec::new();
+        for chunk in view_ixs.chunks(view_set::VIEWS_AT_ONCE) {
+            let places = chunk.iter().map(|view_ix| (*view_ix, 0)).collect();
+            self.views.upload(&mut self.recorder, &places, self.schedule.step)?;
+            for view_ix in chunk {
+                let keyframe = self.views.keyframe(*view_ix).clone();
+                let camera = corrected_camera(&corrections, &keyframe);
+                let (_, Level { image, .. }) = self.views.ready_level((*view_ix, 0))?;
+                let drawn = DrawnView { splats: &self.model.splats, camera: &camera, background_srgb };
+                let products = self.renderer.compare(&mut self.recorder, drawn, &learn.score, image)?;
+                let measured_m = depth_in_color_view(&keyframe);
+                let depth_rmse_m = match measured_m.is_empty() {
+                    true => None,
+                    false => {
+                        let picture =
+                            self.renderer.picture(&mut self.recorder, drawn, Output::Picture { depth: true })?;
+                        let picture = picture.into_picture()?;
+                        depth_rmse_m(&picture.depth_m, &measured_m)?
+                    }
+                };
+                scores.push(HeldOutScore { psnr_db: products::psnr_with_gains(&products, [1.0; 3]), depth_rmse_m });
+            }
+        }
+        Ok(scores)
+    }
+
+    /// The state to display: during a search or trial, the model without the tested change.
+    pub(super) fn displayed_state(&self) -> Option<&Snapshot> {
+        self.growth_search.running().map(|models| &models.main).or_else(|| self.trials.baseline())
+    }
+
+    /// Training step of the model to display.
+    pub(super) fn displayed_step(&self) -> u64 {
+        self.growth_search.running().map_or(self.schedule.step, |models| models.main.schedule.step)
+    }
+
+    #[cfg(test)]
+    pub(in crate::splat) fn growth_limit(&self) -> Option<u32> {
+        (self.growth_search.limit() < u32::MAX).then(|| self.growth_search.limit())
+    }
+
+    #[cfg(test)]
+    pub(in crate::splat) fn n_active_views(&self) -> usize {
+        self.views.n_active()
+    }
+
+    #[cfg(test)]
+    pub(in crate::splat) fn is_growth_search_running(&self) -> bool {
+        self.growth_search.running().is_some()
+    }
+}
