@@ -81,7 +81,7 @@ fn check_invalid_checkpoints_are_reported(folder: &Path) {
     };
     assert!(printed(&whole[..whole.len() / 2]).contains("truncated"));
     assert!(
-        printed(&[&whole[..8], &[9], &whole[9..]].concat()).contains("format version 9, this program reads version 5")
+        printed(&[&whole[..8], &[9], &whole[9..]].concat()).contains("format version 9, this program reads version 6")
     );
     let mut damaged = whole.clone();
     damaged[whole.len() / 2] ^= 1;

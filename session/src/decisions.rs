@@ -18,7 +18,7 @@ use std::sync::mpsc::{SyncSender, sync_channel};
 use std::thread::JoinHandle;
 use trainer::ModelOptions;
 
-const VERSION: u64 = 4;
+const VERSION: u64 = 5;
 /// Name of the log in the run folder.
 const FILE: &str = "decisions.jsonl";
 /// Maximum number of decisions that wait to be written. Training waits while this queue is full.
@@ -546,7 +546,7 @@ mod tests {
         let folder = tempfile::tempdir().expect("a folder");
         let text = written(folder.path());
         for (was, is, expected_error) in [
-            ("\"version\":4", "\"version\":9", "version 9, expected 4"),
+            ("\"version\":5", "\"version\":9", "version 9, expected 5"),
             ("\"version\"", "\"varsion\"", "line 1 has no version"),
             ("\"scale\"", "\"skale\"", "line 1: "),
             ("\"begin\":true", "\"begin\":false", "line 5: must be true"),

@@ -12,7 +12,7 @@ use std::path::Path;
 
 const MAGIC: [u8; 8] = *b"FRIGCKPT";
 /// Version of the layout and of the states of all methods.
-const VERSION: u32 = 5;
+const VERSION: u32 = 6;
 /// Length of magic, version and header length together.
 const PREAMBLE_BYTES: usize = 16;
 const CHECKSUM_BYTES: usize = 32;
@@ -250,7 +250,7 @@ mod tests {
             bytes[at] = to;
             error_of(&bytes)
         };
-        assert_eq!(error_with_byte(8, 1), "format version 1, this program reads version 5");
+        assert_eq!(error_with_byte(8, 1), "format version 1, this program reads version 6");
         assert_eq!(error_with_byte(15, 255), "truncated");
         for at in [20, whole.len() - 40, whole.len() - 1] {
             assert_eq!(error_with_byte(at, 0xff), "damaged: the checksum does not match", "byte {at}");

@@ -3,6 +3,7 @@
 use super::wgsl::{Access, Binding};
 use super::{Gpu, Source, reflect, resolve, wgsl};
 use crate::Error;
+use rayon::prelude::*;
 
 /// A kernel: its WGSL file and the files it may import.
 #[derive(Clone, Copy, Debug)]
@@ -77,6 +78,15 @@ impl Pipeline {
             cache: None,
         });
         Ok(Self { id: gpu.next_unique_id(), name, raw, layout, bindings })
+    }
+
+    /// Compiles several kernels in parallel, because drivers take up to a tenth of a second for each.
+    pub fn compile_all<const N: usize>(gpu: &Gpu, kernels: [(Kernel, &[(&str, f64)]); N]) -> Result<[Self; N], Error> {
+        let compiled: Vec<Self> = kernels
+            .into_par_iter()
+            .map(|(kernel, overrides)| Self::new(gpu, kernel, overrides))
+            .collect::<Result<_, _>>()?;
+        Ok(compiled.try_into().expect("as many pipelines as kernels"))
     }
 }
 

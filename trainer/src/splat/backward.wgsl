@@ -68,15 +68,25 @@ fn tile_of(segment: Segment) -> Tile {
     return tile;
 }
 
-// Writes zeros for hidden splats, because `update` reads their slots.
-fn write_zeros(lane: u32, segment: Segment) {
-    let tile = tile_of(segment);
-    let word = tile.begin / 32u + lane;
-    var bits = entries_of(tile, word);
-    while bits != 0u {
-        let slot = slot_of(word * 32u + firstTrailingBit(bits), tile);
-        bits &= bits - 1u;
-        for (var part = 0u; part < N_PARTS_OF_GRADIENT; part++) { write_gradient(slot, part, 0.0); }
+// Writes the zeros of `n` hidden splats to `wg_slots`, because `update` reads them. Neighboring lanes write neighboring words.
+fn write_zeros(lane: u32, n: u32) {
+    for (var at = lane; at < n * N_PARTS_OF_GRADIENT; at += LANES) {
+        write_gradient(wg_slots[at / N_PARTS_OF_GRADIENT], at % N_PARTS_OF_GRADIENT, 0.0);
+    }
+}
+
+// Writes zeros for a hidden piece of a list. Every lane must call it.
+fn write_hidden(lane: u32, segment: u32) {
+    if lane == 0u { wg_tile = tile_of(segments[segment]); }
+    let tile = workgroupUniformLoad(&wg_tile);
+    for (var word = tile.begin / 32u; word * 32u < tile.end; word += WORDS) {
+        let n_queued = queue_words(lane, word, tile, 0u);
+        for (var batch = 0u; batch < n_queued; batch += BATCH) {
+            if batch + lane < n_queued { wg_slots[lane] = slot_of(wg_queue[batch + lane], tile); }
+            workgroupBarrier(); // The slots are known.
+            write_zeros(lane, min(n_queued - batch, BATCH));
+            workgroupBarrier(); // All lanes have read the slots and the queue.
+        }
     }
 }
 
@@ -84,7 +94,7 @@ fn backward(workgroup: u32, lane: u32) {
     let n_tiles = view.n_tiles.x * view.n_tiles.y;
     let hidden = workgroup - n_tiles - capacity.n_segments; // Wraps around for segments that are not hidden.
     if workgroup >= n_tiles + capacity.n_segments {
-        if hidden < segment_counts[1] { write_zeros(lane, segments[workgroup]); }
+        if hidden < segment_counts[1] { write_hidden(lane, workgroup); }
         return; // Allowed here: the condition is the same for all lanes.
     }
     let later = select(workgroup - n_tiles, NONE, workgroup < n_tiles);
@@ -120,10 +130,7 @@ fn backward(workgroup: u32, lane: u32) {
             take_batch(lane, batch, n_queued, tile);
             let n = min(n_queued - batch, BATCH);
             if bitcast<u32>(wg_splats[0].color.w) >= past_last {
-                // All splats of the batch are hidden in this tile.
-                for (var at = lane; at < n * N_PARTS_OF_GRADIENT; at += LANES) {
-                    write_gradient(wg_slots[at / N_PARTS_OF_GRADIENT], at % N_PARTS_OF_GRADIENT, 0.0);
-                }
+                write_zeros(lane, n); // All splats of the batch are hidden in this tile.
                 continue;
             }
             for (var i = 0u; i < n; i++) {

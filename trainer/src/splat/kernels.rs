@@ -197,17 +197,36 @@ pub(crate) struct DrawPipelines {
 impl DrawPipelines {
     pub(crate) fn new(gpu: &Gpu) -> Result<Self, Error> {
         let blend = blend(gpu);
+        let compile = || {
+            Pipeline::compile_all(
+                gpu,
+                [
+                    kernel!("project"),
+                    kernel!("count_bins"),
+                    kernel!("sum_bins"),
+                    kernel!("scan_bins"),
+                    kernel!("allocate"),
+                    kernel!("emit"),
+                    kernel!("tile_bits"),
+                    blend.rasterize,
+                    kernel!("finish"),
+                ]
+                .map(|kernel| (kernel, &[][..])),
+            )
+        };
+        let (sort, compiled) = rayon::join(|| RadixSort::new(gpu), compile);
+        let [project, count_bins, sum_bins, scan_bins, allocate, emit, tile_bits, rasterize, finish] = compiled?;
         Ok(Self {
-            sort: RadixSort::new(gpu)?,
-            project: Pipeline::new(gpu, kernel!("project"), &[])?,
-            count_bins: Pipeline::new(gpu, kernel!("count_bins"), &[])?,
-            sum_bins: Pipeline::new(gpu, kernel!("sum_bins"), &[])?,
-            scan_bins: Pipeline::new(gpu, kernel!("scan_bins"), &[])?,
-            allocate: Pipeline::new(gpu, kernel!("allocate"), &[])?,
-            emit: Pipeline::new(gpu, kernel!("emit"), &[])?,
-            tile_bits: Pipeline::new(gpu, kernel!("tile_bits"), &[])?,
-            rasterize: Pipeline::new(gpu, blend.rasterize, &[])?,
-            finish: Pipeline::new(gpu, kernel!("finish"), &[])?,
+            sort: sort?,
+            project,
+            count_bins,
+            sum_bins,
+            scan_bins,
+            allocate,
+            emit,
+            tile_bits,
+            rasterize,
+            finish,
             has_segments: blend.rasterize_segments.is_some(),
         })
     }
@@ -255,33 +274,77 @@ impl TrainPipelines {
         let blend = blend(gpu);
         let lanes: Vec<_> = blend.subgroup.map(|lanes| ("SUBGROUP", f64::from(lanes))).into_iter().collect();
         let in_strips = blend.rasterize_segments.is_none();
-        let loss = if in_strips { LOSS_STRIPS } else { SHARED };
-        let ssim = if in_strips {
-            Ssim::Strips {
-                means: Pipeline::new(gpu, kernel!("loss", "ssim_strips", LOSS_STRIPS), &[])?,
-                upstream: Pipeline::new(gpu, kernel!("loss", "ssim_upstream_strips", LOSS_STRIPS), &[])?,
-            }
-        } else {
-            Ssim::Tiles(Pipeline::new(gpu, kernel!("loss", "ssim", SHARED), &[])?)
+        let loss = kernel!("loss", "loss_backward", if in_strips { LOSS_STRIPS } else { SHARED });
+        let by_adapter = || -> Result<_, Error> {
+            let ssim = if in_strips {
+                Ssim::Strips {
+                    means: Pipeline::new(gpu, kernel!("loss", "ssim_strips", LOSS_STRIPS), &[])?,
+                    upstream: Pipeline::new(gpu, kernel!("loss", "ssim_upstream_strips", LOSS_STRIPS), &[])?,
+                }
+            } else {
+                Ssim::Tiles(Pipeline::new(gpu, kernel!("loss", "ssim", SHARED), &[])?)
+            };
+            Ok((ssim, blend.rasterize_segments.map(|kernel| Pipeline::new(gpu, kernel, &[])).transpose()?))
         };
+        let compile = || {
+            Pipeline::compile_all(
+                gpu,
+                [
+                    (loss, &[("SSIM", 1.0)][..]),
+                    (loss, &[("SSIM", 0.0)]),
+                    (blend.backward, &lanes),
+                    (kernel!("update"), &[]),
+                    (kernel!("update", WITH_CAMERA), &[]),
+                    (kernel!("correct_view"), &[]),
+                    (kernel!("refine_camera"), &[]),
+                    (kernel!("advance"), &[]),
+                    (kernel!("grow_weigh"), &[]),
+                    (kernel!("grow_scan"), &[]),
+                    (kernel!("grow_child"), &[]),
+                    (kernel!("grow_family"), &[]),
+                    (kernel!("score"), &[]),
+                    (kernel!("contribute"), &[]),
+                    (kernel!("gather"), &[]),
+                ],
+            )
+        };
+        let (by_adapter, compiled) = rayon::join(by_adapter, compile);
+        let (ssim, rasterize_segments) = by_adapter?;
+        let [
+            loss,
+            loss_without_ssim,
+            backward,
+            update,
+            update_with_camera,
+            correct_view,
+            refine_camera,
+            advance,
+            grow_weigh,
+            grow_scan,
+            grow_child,
+            grow_family,
+            score,
+            contribute,
+            gather,
+        ] = compiled?;
         Ok(Self {
             ssim,
-            loss: Pipeline::new(gpu, kernel!("loss", "loss_backward", loss), &[("SSIM", 1.0)])?,
-            loss_without_ssim: Pipeline::new(gpu, kernel!("loss", "loss_backward", loss), &[("SSIM", 0.0)])?,
-            rasterize_segments: blend.rasterize_segments.map(|kernel| Pipeline::new(gpu, kernel, &[])).transpose()?,
-            backward: Pipeline::new(gpu, blend.backward, &lanes)?,
-            update: Pipeline::new(gpu, kernel!("update"), &[])?,
-            update_with_camera: Pipeline::new(gpu, kernel!("update", WITH_CAMERA), &[])?,
-            correct_view: Pipeline::new(gpu, kernel!("correct_view"), &[])?,
-            refine_camera: Pipeline::new(gpu, kernel!("refine_camera"), &[])?,
-            advance: Pipeline::new(gpu, kernel!("advance"), &[])?,
-            grow_weigh: Pipeline::new(gpu, kernel!("grow_weigh"), &[])?,
-            grow_scan: Pipeline::new(gpu, kernel!("grow_scan"), &[])?,
-            grow_child: Pipeline::new(gpu, kernel!("grow_child"), &[])?,
-            grow_family: Pipeline::new(gpu, kernel!("grow_family"), &[])?,
-            score: Pipeline::new(gpu, kernel!("score"), &[])?,
-            contribute: Pipeline::new(gpu, kernel!("contribute"), &[])?,
-            gather: Pipeline::new(gpu, kernel!("gather"), &[])?,
+            loss,
+            loss_without_ssim,
+            rasterize_segments,
+            backward,
+            update,
+            update_with_camera,
+            correct_view,
+            refine_camera,
+            advance,
+            grow_weigh,
+            grow_scan,
+            grow_child,
+            grow_family,
+            score,
+            contribute,
+            gather,
         })
     }
 

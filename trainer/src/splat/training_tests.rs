@@ -481,7 +481,7 @@ fn viewers_shorten_submits_but_do_not_change_the_result() {
         trainer.set_watched(watched);
         for _ in 0..2 {
             trainer.assume_step_millis(1.0);
-            assert_eq!(trainer.step(100).unwrap(), if watched { 4 } else { 20 });
+            assert_eq!(trainer.step(100).unwrap(), if watched { 2 } else { 20 });
             if watched {
                 let render_request = RenderRequest { depth: false, ..request(keyframes[0].world_from_camera) };
                 assert!(trainer.render(&render_request).unwrap().depth_m.is_empty());

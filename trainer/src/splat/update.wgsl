@@ -141,7 +141,12 @@ fn gradient_of(lane: u32, splat_ix: u32, n_touched: u32) -> Gradient {
     if n_touched > MAX_SLOTS_PER_LANE {
         large_ix = atomicAdd(&wg_n_large, 1u); // The order of large splats does not affect their sums.
         wg_large[large_ix] = splat_ix;
-    } else if n_touched > 0u {
+    }
+    workgroupBarrier(); // All large splats are listed.
+    if lane == 0u { wg_n_large_read = atomicLoad(&wg_n_large); }
+    let n_large = workgroupUniformLoad(&wg_n_large_read);
+    // After the barriers, so that subgroups do not wait for each other.
+    if n_touched > 0u && n_touched <= MAX_SLOTS_PER_LANE {
         let begin = slot_begins[splat_ix];
         for (var slot = begin; slot < begin + n_touched; slot++) {
             sum.position += gradients[3u * slot];
@@ -149,9 +154,6 @@ fn gradient_of(lane: u32, splat_ix: u32, n_touched: u32) -> Gradient {
             sum.color += gradients[3u * slot + 2u];
         }
     }
-    workgroupBarrier(); // All large splats are listed.
-    if lane == 0u { wg_n_large_read = atomicLoad(&wg_n_large); }
-    let n_large = workgroupUniformLoad(&wg_n_large_read);
     for (var first = 0u; first < n_large; first += N_TEAMS) {
         let large = first + lane / 32u;
         var part = vec4f(0.0);
