@@ -52,7 +52,7 @@ pub enum Candidate {
         /// Splats after.
         to: u32,
     },
-    /// Doubles the number of splats. Models of each part of the images are scored on the other images.
+    /// Doubles the number of splats. Tested by cross-validation.
     Doubled {
         /// Splats before.
         from: u32,

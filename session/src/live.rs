@@ -313,18 +313,26 @@ impl Live {
             self.budget.add_training(before.elapsed());
             let before = Instant::now();
             // The GPU draws the next pictures while the first ones are delivered.
-            let queued: Vec<_> = std::iter::from_fn(|| self.queue_picture()).take(MAX_QUEUED_PICTURES).collect();
-            for (pending, session_ix, queued) in queued {
-                self.deliver(pending, session_ix, queued);
+            let mut queued = Vec::new();
+            while let Some(picture) = self.queue_picture() {
+                let is_on_gpu = picture.queued.as_ref().is_ok_and(|queued| !queued.is_ready());
+                queued.push(picture);
+                if !is_on_gpu || queued.len() == MAX_QUEUED_PICTURES {
+                    break;
+                }
+            }
+            let mut began = before;
+            for picture in queued {
+                self.deliver(picture, began);
+                began = Instant::now();
             }
             self.budget.add_render(before.elapsed());
         }
         Ok(())
     }
 
-    /// Starts to draw the next requested picture. Returns the request, the index of its session, and the picture.
-    /// Requests that cannot be drawn are answered.
-    fn queue_picture(&mut self) -> Option<(PendingRender, usize, Result<QueuedPicture, trainer::Error>)> {
+    /// Starts to draw the next requested picture. Requests that cannot be drawn are answered.
+    fn queue_picture(&mut self) -> Option<QueuedRender> {
         loop {
             let pending = self.hub.next_request()?;
             if self.keyframes.is_empty() {
@@ -341,12 +349,13 @@ impl Live {
             let session = &mut self.sessions[session_ix];
             let queued = session.queue_picture(&pending.request, pending.packing());
             let n_keyframes = self.ledger.n_in_model(session.progress().step);
-            return Some((pending.of_keyframes(n_keyframes as u64), session_ix, queued));
+            return Some(QueuedRender { pending: pending.of_keyframes(n_keyframes as u64), session_ix, queued });
         }
     }
 
-    /// Waits for a picture and sends it to its client.
-    fn deliver(&mut self, pending: PendingRender, session_ix: usize, queued: Result<QueuedPicture, trainer::Error>) {
+    /// Waits for a picture, whose rendering began at `began`, and sends it to its client.
+    fn deliver(&mut self, QueuedRender { pending, session_ix, queued }: QueuedRender, began: Instant) {
+        let pending = pending.began_at(began);
         let session = &mut self.sessions[session_ix];
         match queued.and_then(|queued| session.finish_picture(queued, &pending.request, pending.packing())) {
             Ok(picture) => pending.deliver(picture),
@@ -466,6 +475,13 @@ impl Live {
             }
         }
     }
+}
+
+/// A requested picture that the GPU may still be drawing.
+struct QueuedRender {
+    pending: PendingRender,
+    session_ix: usize,
+    queued: Result<QueuedPicture, trainer::Error>,
 }
 
 /// Options of a live run.

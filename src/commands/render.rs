@@ -116,7 +116,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let mut covered_fracs = Vec::new();
     for (ix, request) in requests.iter().enumerate() {
         let since = Instant::now();
-        let picture = model.render(&RenderRequest { background_srgb: model.background_srgb(), ..request.clone() })?;
+        let picture = model.render(request)?;
         let draw_millis = since.elapsed().as_secs_f64() * 1e3;
         covered_fracs.push(covered_frac(&picture));
         let (picture, depth) = write(&args.out, ix, &picture, args.depth)?;

@@ -231,7 +231,7 @@ mod tests {
         let empty = Checkpoint::new("m", 7.into(), Vec::new());
         let bytes = bytes_of(&empty);
         let json = r#"{"method":"m","seconds":0.0,"state":7,"arrays":[]}"#;
-        assert_eq!(bytes[..16], *b"FRIGCKPT\x05\0\0\0\x32\0\0\0");
+        assert_eq!(bytes[..16], *b"FRIGCKPT\x06\0\0\0\x32\0\0\0");
         assert_eq!(bytes[16..66], *json.as_bytes());
         assert_eq!(bytes[66..], Sha256::digest(&bytes[..66])[..]);
     }

@@ -77,7 +77,7 @@ pub trait Method {
     fn psnr(&mut self, _request: &RenderRequest, _keyframe: &Keyframe) -> Result<Option<f64>, Error> {
         Ok(None)
     }
-    /// Background for comparisons with images, sRGB 0 to 1: the expected color of what no training image shows.
+    /// Background for comparisons with images, sRGB 0 to 1: the expected color of unobserved areas.
     fn background_srgb(&self) -> [f32; 3] {
         [0.0; 3]
     }

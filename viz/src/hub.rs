@@ -182,9 +182,16 @@ impl PendingRender {
         self
     }
 
-    /// How the client receives this stage; `None` if that cannot be packed on the GPU.
+    /// How this stage is packed on the GPU; `None` if the client requested a format that the GPU does not support.
     pub fn packing(&self) -> Option<Packing> {
         packing(&self.job.view_request, self.job.stage + 1 == self.job.view_request.stages.len())
+    }
+
+    /// Sets when rendering began, if other pictures of a batch were rendered first.
+    #[must_use]
+    pub fn began_at(mut self, began: Instant) -> Self {
+        self.started = self.started.max(began);
+        self
     }
 
     /// Sends the rendered picture to the client. Encoding happens on the server's threads.

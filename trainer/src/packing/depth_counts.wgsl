@@ -1,4 +1,4 @@
-// depth_counts: halved depths as 16-bit counts of a step for which the largest depth is 65535.
+// depth_counts: quantize the halved depths to 16 bits; the largest depth becomes 65535.
 //
 // threads   one per pair of squares
 // reads     packing, halved [n_squares] (meters, 0: none), packed (FURTHEST)

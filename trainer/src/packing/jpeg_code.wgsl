@@ -14,7 +14,7 @@
 @group(0) @binding(0) var<uniform> packing: Packing;
 @group(0) @binding(1) var<storage, read> coefficients: array<i32>;
 @group(0) @binding(2) var<storage, read> non_zero: array<u32>;
-@group(0) @binding(3) var<storage, read> codes: array<u32>; // length in the high 16 bits; tables for brightness, then for color
+@group(0) @binding(3) var<storage, read> codes: array<u32>; // length in the high 16 bits; tables for luminance, then for chrominance
 @group(0) @binding(4) var<storage, read_write> coded: array<u32>;
 @group(0) @binding(5) var<storage, read_write> n_coded: array<u32>;
 @group(0) @binding(6) var<storage, read_write> packed: array<atomic<u32>>;
@@ -42,7 +42,7 @@ fn put_byte(writer: ptr<function, Writer>, byte: u32) {
     }
 }
 
-// Appends up to 16 bits. A byte of ones is followed by zeros, unlike a marker.
+// Appends up to 16 bits. A zero byte is stuffed after 0xff, so that it is not read as a marker (T.81, F.1.2.3).
 fn put_bits(writer: ptr<function, Writer>, bits: u32, n_bits: u32) {
     (*writer).bits = (*writer).bits << n_bits | bits;
     (*writer).n_bits += n_bits;

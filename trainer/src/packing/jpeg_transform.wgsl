@@ -1,6 +1,6 @@
 // jpeg_transform: color conversion, discrete cosine transform and quantization of 8 x 8 pixels.
 //
-// threads   64 per square, one per pixel
+// threads   64 per MCU (8 x 8 pixels), one per pixel
 // reads     packing, pixels [n_pixels] (rgba8), tables (see tables.rs)
 // writes    coefficients [n_mcus, 3, 64] in zigzag order, non_zero [n_mcus, 3, 2] (bit masks of the coefficients)
 // source    ITU-T T.81, sections A.3.3 and A.3.4; colors of JFIF (ITU-T T.871)
@@ -15,7 +15,7 @@
 @group(0) @binding(4) var<storage, read_write> non_zero: array<u32>;
 
 const BASIS = 0u;          // offsets in `tables`
-const QUANTIZERS = 64u;    // reciprocals: brightness, color
+const QUANTIZERS = 64u;    // reciprocals: luminance, chrominance
 const ZIGZAG = 192u;
 
 var<workgroup> wg_samples: array<vec3f, 64>;
@@ -47,11 +47,11 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     let quantizers = vec3f(tables[QUANTIZERS + lane], vec2f(tables[QUANTIZERS + 64u + lane]));
     let quantized = vec3i(clamp(round(sum * quantizers), vec3f(-1023.0), vec3f(1023.0)));
     let order = u32(tables[ZIGZAG + lane]);
-    let is_square = mcu < packing.n_mcus.x * packing.n_mcus.y;
+    let is_mcu = mcu < packing.n_mcus.x * packing.n_mcus.y;
     for (var color = 0u; color < 3u; color++) {
-        if is_square { coefficients[(3u * mcu + color) * 64u + order] = quantized[color]; }
+        if is_mcu { coefficients[(3u * mcu + color) * 64u + order] = quantized[color]; }
         if quantized[color] != 0 { atomicOr(&wg_masks[2u * color + order / 32u], 1u << (order % 32u)); }
     }
     workgroupBarrier(); // The masks are complete.
-    if is_square && lane < 6u { non_zero[6u * mcu + lane] = atomicLoad(&wg_masks[lane]); }
+    if is_mcu && lane < 6u { non_zero[6u * mcu + lane] = atomicLoad(&wg_masks[lane]); }
 }

@@ -1,5 +1,5 @@
-//! Packs pictures on the GPU for viewers: color as JPEG, depth as 16-bit counts at half size. The data to read back is a
-//! tenth of the picture's, and the processor has nothing left to compute.
+//! Packs pictures on the GPU for viewers: color as JPEG, depth as 16-bit counts at half resolution. This reduces the
+//! read-back to about a fifth, and the CPU no longer encodes.
 
 mod tables;
 
@@ -7,11 +7,11 @@ use crate::gpu::{Buffer, Gpu, Kernel, Passes, PendingRead, Pipeline, Source};
 use crate::view::{Camera, projections};
 use crate::{Error, Picture, Projection, RenderRequest};
 
-/// Squares of 8 x 8 pixels per restart interval, which one lane encodes.
+/// MCUs (8 x 8 pixels, no subsampling) per restart interval, which one lane encodes.
 const MCUS_PER_INTERVAL: u32 = 8;
 /// Capacity of an interval, in words: twice the average of a file of [`WORDS_PER_MCU`].
 const WORDS_PER_INTERVAL: u32 = 2 * WORDS_PER_MCU * MCUS_PER_INTERVAL;
-/// Maximum average of coded words per square. At quality 92, pictures of splats need about 6.
+/// Maximum average of coded words per MCU. At quality 92, pictures of splats need about 6.
 const WORDS_PER_MCU: u32 = 16;
 /// Words before the coded words.
 const HEADER_WORDS: u32 = 4;
@@ -21,16 +21,6 @@ const HEADER_WORDS: u32 = 4;
 pub(crate) enum Output {
     Picture { depth: bool },
     Packed(Packing),
-}
-
-impl Output {
-    /// Packs only on GPUs. On a software adapter, kernels take longer than the encoders of the server.
-    pub(crate) fn on(self, gpu: &Gpu) -> Self {
-        match self {
-            Self::Packed(Packing { depth, .. }) if gpu.is_software() => Self::Picture { depth },
-            _ => self,
-        }
-    }
 }
 
 /// What to pack.
@@ -87,7 +77,7 @@ pub struct QueuedPicture(Queued);
 #[derive(Debug)]
 enum Queued {
     Ready(Rendered),
-    /// Reads counters, and what [`Packer::record`] returns. The counters tell whether the picture is complete.
+    /// The first part of `read` has the counters that `is_complete` checks; the others are from [`Packer::record`].
     Packed {
         read: PendingRead,
         is_complete: fn(&[u8]) -> bool,
@@ -102,8 +92,8 @@ impl QueuedPicture {
         Self(Queued::Ready(rendered))
     }
 
-    /// A picture on the GPU. The first part of `read` tells `is_complete` whether the buffers were large enough; the others
-    /// are those of [`Packer::record`].
+    /// A picture on the GPU. From the first part of `read`, `is_complete` determines whether the buffers were large
+    /// enough; the other parts are from [`Packer::record`].
     pub(crate) fn packed(
         read: PendingRead,
         is_complete: fn(&[u8]) -> bool,
@@ -111,6 +101,11 @@ impl QueuedPicture {
         size_px: [u32; 2],
     ) -> Self {
         Self(Queued::Packed { read, is_complete, packing, size_px })
+    }
+
+    /// Whether the picture is finished.
+    pub fn is_ready(&self) -> bool {
+        matches!(self.0, Queued::Ready(_))
     }
 
     /// Waits for the picture. `None` if a buffer was too small: [`Method::render_packed`](crate::Method::render_packed)
@@ -291,6 +286,17 @@ impl Packer {
         })
     }
 
+    /// Allocates buffers for pictures of this size.
+    fn reserve(&mut self, gpu: &Gpu, passes: &mut Passes, sizes: Sizes) -> Result<(), Error> {
+        let fits = |buffers: &Buffers| buffers.n_mcus >= sizes.n_mcus() && buffers.n_squares >= sizes.n_squares();
+        if !self.buffers.as_ref().is_some_and(fits) {
+            passes.clear_bindings();
+            self.buffers = None; // Freed before the larger ones are allocated.
+            self.buffers = Some(Buffers::new(gpu, sizes)?);
+        }
+        Ok(())
+    }
+
     /// Records the passes that pack a picture of `size_px`: `pixels` (rgba8) and `depths` (meters). Returns the buffers to
     /// read back for [`unpack`].
     pub(crate) fn record(
@@ -302,12 +308,7 @@ impl Packer {
         [pixels, depths]: [&Buffer; 2],
     ) -> Result<Vec<(&Buffer, usize)>, Error> {
         let sizes = Sizes::of(size_px);
-        let fits = |buffers: &Buffers| buffers.n_mcus >= sizes.n_mcus() && buffers.n_squares >= sizes.n_squares();
-        if !self.buffers.as_ref().is_some_and(fits) {
-            passes.clear_bindings();
-            self.buffers = None; // Freed before the larger ones are allocated.
-            self.buffers = Some(Buffers::new(gpu, sizes)?);
-        }
+        self.reserve(gpu, passes, sizes)?;
         if let Some(quality) = packing.jpeg_quality
             && self.tables.as_ref().is_none_or(|(of, _)| *of != quality)
         {
@@ -360,6 +361,24 @@ impl LazyPacker {
         self.0.as_mut().ok_or(Error::DeviceLost)
     }
 
+    /// The same output, or an unpacked picture if the adapter is a CPU or GPU memory is too small for packing.
+    pub(crate) fn available(
+        &mut self,
+        gpu: &Gpu,
+        passes: &mut Passes,
+        output: Output,
+        size_px: [u32; 2],
+    ) -> Result<Output, Error> {
+        let Output::Packed(Packing { depth, .. }) = output else { return Ok(output) };
+        if gpu.is_software() {
+            return Ok(Output::Picture { depth }); // Kernels would take longer than the encoders of the server.
+        }
+        match self.get(gpu)?.reserve(gpu, passes, Sizes::of(size_px)) {
+            Err(error) if error.is_out_of_memory() => Ok(Output::Picture { depth }),
+            reserved => reserved.map(|()| output),
+        }
+    }
+
     /// Submits the passes that draw a picture into `pixels` (rgba8) and `depths` (meters), and reads it back.
     pub(crate) fn read(
         &mut self,
@@ -369,7 +388,7 @@ impl LazyPacker {
         size_px: [u32; 2],
         canvas: [&Buffer; 2],
     ) -> Result<Rendered, Error> {
-        let has_depth = match output.on(gpu) {
+        let has_depth = match self.available(gpu, passes, output, size_px)? {
             Output::Picture { depth } => depth,
             Output::Packed(packing) => {
                 let reads = self.get(gpu)?.record(gpu, passes, packing, size_px, canvas)?;
@@ -384,7 +403,7 @@ impl LazyPacker {
     }
 }
 
-/// Submits the passes and reads the picture back as it is.
+/// Submits the passes and reads the picture back without packing it.
 pub(crate) fn read_picture(
     gpu: &Gpu,
     passes: &mut Passes,

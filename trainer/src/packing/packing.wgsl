@@ -2,7 +2,7 @@
 
 struct Packing {
     size_px: vec2u,
-    n_mcus: vec2u,         // squares of 8 x 8 pixels along x and y
+    n_mcus: vec2u,         // MCUs of 8 x 8 pixels along x and y
     n_intervals: u32,      // restart intervals
     mcus_per_interval: u32,
     words_per_interval: u32, // capacity of the coded words of an interval

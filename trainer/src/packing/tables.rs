@@ -2,15 +2,15 @@
 
 use std::f64::consts::PI;
 
-/// Quantization of brightness at quality 50, row by row (table K.1).
-const BRIGHTNESS: [u8; 64] = [
+/// Quantization of luminance at quality 50, row by row (table K.1).
+const LUMINANCE: [u8; 64] = [
     16, 11, 10, 16, 24, 40, 51, 61, 12, 12, 14, 19, 26, 58, 60, 55, 14, 13, 16, 24, 40, 57, 69, 56, 14, 17, 22, 29, 51,
     87, 80, 62, 18, 22, 37, 56, 68, 109, 103, 77, 24, 35, 55, 64, 81, 104, 113, 92, 49, 64, 78, 87, 103, 121, 120, 101,
     72, 92, 95, 98, 112, 100, 103, 99,
 ];
 
-/// Quantization of color at quality 50 in the first four rows and columns (table K.2); 99 elsewhere.
-const COLOR: [[u8; 4]; 4] = [[17, 18, 24, 47], [18, 21, 26, 66], [24, 26, 56, 99], [47, 66, 99, 99]];
+/// Quantization of chrominance at quality 50 in the first four rows and columns (table K.2); 99 elsewhere.
+const CHROMINANCE: [[u8; 4]; 4] = [[17, 18, 24, 47], [18, 21, 26, 66], [24, 26, 56, 99], [47, 66, 99, 99]];
 
 /// Numbers of codes with 1 to 16 bits, and the symbols in order of their codes (tables K.3 to K.6).
 struct Huffman {
@@ -20,7 +20,7 @@ struct Huffman {
 
 const DC_SYMBOLS: &[u8] = &[0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11];
 
-/// DC and AC of brightness, then of color.
+/// DC and AC codes of luminance, then of chrominance.
 const HUFFMAN: [Huffman; 4] = [
     Huffman { n_codes: [0, 1, 5, 1, 1, 1, 1, 1, 1, 0, 0, 0, 0, 0, 0, 0], symbols: DC_SYMBOLS },
     Huffman {
@@ -69,16 +69,16 @@ fn zigzag() -> [usize; 64] {
     positions
 }
 
-/// Quantization of brightness and color, row by row, scaled as in the software of the Independent JPEG Group.
+/// Quantization of luminance and chrominance, row by row, scaled as in the software of the Independent JPEG Group.
 fn quantizers(quality: u8) -> [[u8; 64]; 2] {
     let quality = u32::from(quality.clamp(1, 100));
     let percent = if quality < 50 { 5000 / quality } else { 200 - 2 * quality };
     let scaled = |base: u8| u8::try_from(((u32::from(base) * percent + 50) / 100).clamp(1, 255)).unwrap_or(u8::MAX);
-    let color = |at: usize| COLOR.get(at / 8).and_then(|row| row.get(at % 8)).copied().unwrap_or(99);
-    [BRIGHTNESS.map(scaled), std::array::from_fn(|at| scaled(color(at)))]
+    let chrominance = |at: usize| CHROMINANCE.get(at / 8).and_then(|row| row.get(at % 8)).copied().unwrap_or(99);
+    [LUMINANCE.map(scaled), std::array::from_fn(|at| scaled(chrominance(at)))]
 }
 
-/// The table of `jpeg_transform`: cosines `[frequency, position]`; reciprocal quantizers of brightness and color, row by
+/// The table of `jpeg_transform`: cosines `[frequency, position]`; reciprocal quantizers of luminance and chrominance, row by
 /// row; zigzag positions, row by row.
 pub(super) fn transform_tables(quality: u8) -> Vec<f32> {
     let basis = (0..64).map(|at| {
@@ -91,7 +91,7 @@ pub(super) fn transform_tables(quality: u8) -> Vec<f32> {
     basis.chain(reciprocals).chain(positions).map(crate::gpu::f32_of).collect()
 }
 
-/// The table of `jpeg_code`, for brightness, then for color: codes of 16 DC categories and of 256 AC symbols, with their
+/// The table of `jpeg_code`, for luminance, then for chrominance: codes of 16 DC categories and of 256 AC symbols, with their
 /// lengths in the high 16 bits.
 pub(super) fn codes() -> Vec<u32> {
     HUFFMAN.chunks_exact(2).flat_map(|pair| [codes_of(&pair[0], 16), codes_of(&pair[1], 256)].concat()).collect()

@@ -1,7 +1,7 @@
 // segment: a part of a tile's list, which one workgroup of `backward` processes.
 //
-// Lists differ in length by orders of magnitude, and a step would wait for the longest. `rasterize` divides them into
-// segments and stores the state of the tile's pixels at the beginning of each segment except the first.
+// The longest lists are about ten times the average, and a step would wait for them. `rasterize` divides lists into
+// segments and stores the state of the tile's pixels at the start of every segment but the first.
 
 struct Segment {
     tile: u32,
@@ -11,12 +11,12 @@ struct Segment {
 }
 
 const SEGMENT_SPLATS = 128u;      // minimum length; a batch of `rasterize`
-const MAX_SEGMENTS = 16384u;      // lengths are multiples of the minimum, such that there are at most twice as many
+const TARGET_SEGMENTS = 16384u;   // lengths are rounded down to whole batches, so there can be twice as many
 const N_STATE_PARTS = 5u;         // red, green, blue, depth, transmittance
 const STATE_PAIRS = 128u;         // pairs of pixels in a tile: 32 quarter + lane
 const HIDDEN_ENTRIES = 1024u;     // entries per piece of a list's hidden end
 
 // Length of segments in batches, if the view has this many intersections.
 fn batches_per_segment(n_slots: u32) -> u32 {
-    return max(n_slots / (SEGMENT_SPLATS * MAX_SEGMENTS), 1u);
+    return max(n_slots / (SEGMENT_SPLATS * TARGET_SEGMENTS), 1u);
 }

@@ -1,5 +1,5 @@
-//! Regularization of models of few images. It fades out as the number of images rises, because it costs detail if there
-//! are many images.
+//! Regularization of models trained on few images. It fades out as the number of images rises, because it costs detail
+//! with many images.
 
 use super::growth_search::FEW_IMAGES;
 use crate::gpu::f32_of;
@@ -11,8 +11,8 @@ const VERY_FEW_IMAGES: usize = 20;
 const DROP_RAMP_FRAC: f64 = 0.2;
 /// Depth residuals above this limit have no gradient.
 const DEPTH_CLIP_M: f64 = 0.2;
-/// The same for few images. Splats in front of the surface are further from it than [`DEPTH_CLIP_M`]. Many images show
-/// them to be wrong; with few images, only depth does.
+/// Limit for few images. Splats that float in front of a surface are often farther from it than [`DEPTH_CLIP_M`]. With
+/// many images, the color loss removes them; with few images, only the depth loss does.
 const FEW_DEPTH_CLIP_M: f64 = 1.0;
 /// Weight of the depth loss for few images, relative to the usual weight.
 const FEW_DEPTH_WEIGHT: f64 = 3.0;
@@ -22,7 +22,7 @@ const FEW_DEPTH_WEIGHT: f64 = 3.0;
 pub(crate) struct Scarcity(f64);
 
 impl Scarcity {
-    /// Scarcity of `n` training images.
+    /// Scarcity for `n` images, counting validation images.
     pub(crate) fn of_images(n: usize) -> Self {
         let missing = FEW_IMAGES.saturating_sub(n) as f64 / (FEW_IMAGES - VERY_FEW_IMAGES) as f64;
         Self(missing.min(1.0))
@@ -43,14 +43,13 @@ impl Scarcity {
         self.between(1.0, FEW_DEPTH_WEIGHT)
     }
 
-    /// Background of pictures, given the mean color of the images: the expected color of what no image shows. Black if
-    /// there are many images.
+    /// Background of pictures: the mean color of the images, the best guess for unobserved areas. Black with many images.
     pub(crate) fn background_srgb(self, mean_srgb: [f32; 3]) -> [f32; 3] {
         mean_srgb.map(|color| f32_of(self.0) * color)
     }
 
-    /// Smallest color of the random background during training. If possible, it varies by up to `range` around the
-    /// background of pictures, and otherwise from black.
+    /// Lower end of the random background's range of colors during training. With few images, the range is centered at the
+    /// mean color, as far as it fits into 0 to 1; with many images, it begins at black.
     pub(crate) fn min_background_srgb(self, mean_srgb: [f32; 3], range: f64) -> [f32; 3] {
         mean_srgb.map(|color| f32_of(self.0 * (f64::from(color) - 0.5 * range).clamp(0.0, (1.0 - range).max(0.0))))
     }

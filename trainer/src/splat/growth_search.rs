@@ -1,11 +1,10 @@
 //! Cross-validation that limits the number of splats if there are few images.
 //!
-//! A few images do not determine many splats: beyond some number, the scores of other views fall while those of the
-//! training images still rise. Too few images can be excluded from training to measure this, so the images are divided
-//! into folds instead. For each fold, a model is trained from the start on the images of the other folds. It is then
-//! trained further with the same and with twice the number of splats, and both are scored on the images of the fold. If
-//! twice the number scores better on average, the models with twice the number are doubled again. The model that is
-//! trained on all images waits until its limit is known.
+//! With few images, models with many splats overfit: beyond some number, the scores of other views fall while those of the
+//! training images still rise. There are too few images for a validation set, so the number is limited by
+//! cross-validation. For each fold, a new model is trained on the images of the other folds. It is then trained further
+//! with the same and with twice the number of splats, and both results are scored on the images of the fold. If doubling
+//! improves the mean score, the search continues from the doubled models. Training on all images is paused meanwhile.
 
 use super::snapshot::Snapshot;
 use super::trials::ImageId;
@@ -14,15 +13,17 @@ use serde::{Deserialize, Serialize};
 
 /// From this number of images on, the number of splats is not limited.
 pub(crate) const FEW_IMAGES: usize = 40;
-/// Step of the search. Before this step, the models are too coarse for a decision.
+/// Step at which the search starts. Earlier, the models are too coarse for a decision.
 pub(crate) const SEARCH_START: u64 = 800;
-/// Maximum number of steps before the first comparison.
+/// Steps that the model on all images is trained for between a change of the images and the search.
+pub(crate) const SEARCH_PAUSE: u64 = 500;
+/// Maximum number of steps that train the model of a fold before the first comparison.
 pub(crate) const MAX_WARM_UP: u64 = 2 * SEARCH_START;
-/// Steps with the same and with twice the number of splats.
+/// Steps that train each of the two models of a comparison.
 pub(crate) const COMPARED_STEPS: u64 = 250;
 /// Maximum number of folds.
 const MAX_FOLDS: usize = 3;
-/// Growth of the number of images that makes a new search necessary.
+/// A new search starts when the number of images has grown by this factor.
 const NEW_SEARCH_GROWTH: f64 = 1.25;
 
 /// State of the search.
@@ -30,8 +31,11 @@ const NEW_SEARCH_GROWTH: f64 = 1.25;
 pub(crate) enum GrowthSearch {
     /// The number of splats is not limited.
     Off,
-    /// The search starts at [`SEARCH_START`].
-    Waiting,
+    /// The search starts at [`SEARCH_START`] or later.
+    Waiting {
+        /// Step before which it does not start.
+        not_before: u64,
+    },
     Running(Box<FoldModels>),
     Finished(GrowthLimit),
 }
@@ -51,6 +55,8 @@ pub(crate) struct GrowthLimit {
 #[serde(deny_unknown_fields)]
 pub(crate) struct SavedGrowthSearch {
     limit: Option<GrowthLimit>,
+    not_before: u64,
+    is_off: bool,
 }
 
 /// The models of a running search.
@@ -65,11 +71,13 @@ pub(crate) struct FoldModels {
     pub(crate) phase: FoldPhase,
     /// Last step of this phase.
     pub(crate) until: u64,
-    /// Number of splats with which a doubled number is compared; the number in `main`, doubled in each earlier round.
+    /// Number of splats of the baseline in terms of `main`: its number, doubled in each accepted round.
     pub(crate) n_splats: u32,
     /// The model before its number of splats is doubled.
     pub(crate) fork: Option<Snapshot>,
-    /// Results of the previous round for the remaining folds, in order.
+    /// Whether GPU memory was too small for a larger `main`.
+    pub(crate) is_main_full: bool,
+    /// Doubled models of the previous round, for the remaining folds.
     pub(crate) previous: std::collections::VecDeque<Snapshot>,
     /// Models with twice the number of splats.
     pub(crate) doubled: std::collections::VecDeque<Snapshot>,
@@ -101,7 +109,7 @@ pub(crate) struct HeldOutScore {
 
 impl GrowthSearch {
     pub(crate) fn new(is_tested: bool) -> Self {
-        if is_tested { Self::Waiting } else { Self::Off }
+        if is_tested { Self::Waiting { not_before: 0 } } else { Self::Off }
     }
 
     /// The running search.
@@ -116,7 +124,7 @@ impl GrowthSearch {
 
     /// Ends the running search without a result, so that it is repeated. Returns its models.
     pub(crate) fn abort(&mut self) -> Option<Box<FoldModels>> {
-        match std::mem::replace(self, Self::Waiting) {
+        match std::mem::replace(self, Self::Waiting { not_before: 0 }) {
             Self::Running(models) => Some(models),
             other => {
                 *self = other;
@@ -125,7 +133,7 @@ impl GrowthSearch {
         }
     }
 
-    /// Whether splats may be added at the regular changes of their number.
+    /// Whether regular densification may add splats.
     pub(crate) fn may_grow(&self) -> bool {
         self.running().is_none_or(|models| models.phase == FoldPhase::WarmUp)
     }
@@ -138,32 +146,49 @@ impl GrowthSearch {
     /// Steps until the phase of a running search ends, or until a search may start.
     pub(crate) fn steps_left(&self, step: u64) -> u64 {
         match self {
-            Self::Waiting if step < SEARCH_START => SEARCH_START - step,
+            Self::Waiting { not_before } if step < SEARCH_START.max(*not_before) => {
+                SEARCH_START.max(*not_before) - step
+            }
             Self::Running(models) => models.until.saturating_sub(step).max(1),
             _ => u64::MAX,
         }
     }
 
-    /// Adapts to a changed number of images. With many images, or with many more than the search used, its limit is no
-    /// longer valid.
+    /// Postpones a search that has not started at `step`, because the images have changed. Otherwise, if images arrived
+    /// often, training on all images would always be paused.
+    pub(crate) fn postpone(&mut self, step: u64) {
+        if let Self::Waiting { not_before } = self
+            && step >= SEARCH_START
+        {
+            *not_before = step + SEARCH_PAUSE;
+        }
+    }
+
+    /// Discards the limit if there are many images, or many more than the search used.
     pub(crate) fn set_n_images(&mut self, n_images: usize) {
         if let Self::Finished(limit) = self
             && (n_images >= FEW_IMAGES || n_images as f64 >= NEW_SEARCH_GROWTH * limit.n_images as f64)
         {
-            *self = Self::Waiting;
+            *self = Self::Waiting { not_before: 0 };
         }
     }
 
     /// State for a checkpoint.
     pub(crate) fn saved(&self) -> SavedGrowthSearch {
-        SavedGrowthSearch { limit: if let Self::Finished(limit) = self { Some(*limit) } else { None } }
+        SavedGrowthSearch {
+            limit: if let Self::Finished(limit) = self { Some(*limit) } else { None },
+            not_before: if let Self::Waiting { not_before } = self { *not_before } else { 0 },
+            is_off: matches!(self, Self::Off),
+        }
     }
 
     /// Restores the state from a checkpoint.
     pub(crate) fn restore(&mut self, saved: SavedGrowthSearch) {
-        if let Some(limit) = saved.limit {
-            *self = Self::Finished(limit);
-        }
+        *self = match saved {
+            SavedGrowthSearch { is_off: true, .. } => Self::Off,
+            SavedGrowthSearch { limit: Some(limit), .. } => Self::Finished(limit),
+            SavedGrowthSearch { not_before, .. } => Self::Waiting { not_before },
+        };
     }
 }
 

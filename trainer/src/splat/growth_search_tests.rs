@@ -1,7 +1,7 @@
 //! Tests of the growth search: few images limit the number of splats, many images do not, and interruptions of a search
 //! have no effect.
 
-use super::growth_search::{FEW_IMAGES, SEARCH_START};
+use super::growth_search::{FEW_IMAGES, SEARCH_PAUSE, SEARCH_START};
 use super::training_tests::{n_keyframes, noisy, options, train};
 use super::trials::CountPolicy;
 use super::{SplatOptions, SplatTrainer};
@@ -29,7 +29,7 @@ fn new_trainer(gpu: &Arc<Gpu>, options: ModelOptions<SplatOptions>, keyframes: &
     trainer
 }
 
-/// Keyframes without validation keyframes, whose late use as training keyframes would add splats.
+/// Keyframes without validation keyframes, because releasing them during the search would add splats.
 fn without_validation(keyframes: Vec<Arc<Keyframe>>) -> Vec<Arc<Keyframe>> {
     let train = |keyframe: Arc<Keyframe>| match keyframe.split {
         Split::Validation => Arc::new(Keyframe { split: Split::Train, ..keyframe.as_ref().clone() }),
@@ -68,7 +68,7 @@ fn few_noisy_images_stop_growth() {
     assert!(unlimited.progress().primitives > n_before, "{:?}", unlimited.progress());
 }
 
-/// Without noise, a model with much fewer splats than the scene has details improves if it grows.
+/// Without noise, a model with too few splats for the details of the scene improves if it grows.
 #[test]
 fn useful_growth_continues() {
     let gpu = Gpu::open(&GpuOptions::default()).unwrap();
@@ -98,7 +98,7 @@ fn many_images_are_not_tested() {
 /// A keyframe that arrives during a search restarts it. A checkpoint continues with the same result.
 #[test]
 fn interrupted_search_is_repeated() {
-    const END: u64 = SEARCH_START + 50;
+    const END: u64 = SEARCH_START + SEARCH_PAUSE + 50;
     let gpu = Gpu::open(&GpuOptions::default()).unwrap();
     let keyframes = without_validation(n_keyframes(&gpu, 12, true));
     let start_search = || {

@@ -238,17 +238,18 @@ impl Method for SplatTrainer {
             );
             return Ok(());
         }
+        self.abort_growth_search()?; // It is repeated with this keyframe.
         if keyframe.split == Split::Validation && self.trials.holds_validation() {
             self.trials.validation.push(ValidationImage { keyframe, image: None });
+            self.update_growth_search();
             return Ok(());
         }
-        self.abort_growth_search()?; // It is repeated with this keyframe.
         // Both halves of a trial train on the same keyframes at the same steps.
         if self.trials.defer_arrival(&keyframe, self.schedule.step) {
             return Ok(());
         }
         self.add_arrival(keyframe)?;
-        self.growth_search.set_n_images(self.n_images());
+        self.update_growth_search();
         Ok(())
     }
 
@@ -259,6 +260,7 @@ impl Method for SplatTrainer {
         self.views.retain(|keyframe| !is_removed(keyframe));
         self.seeding.remove(is_removed);
         self.trials.remove(is_removed);
+        self.update_growth_search();
         self.recorder.passes.clear_bindings();
         Ok(())
     }
@@ -309,7 +311,7 @@ impl Method for SplatTrainer {
         let Projection::Pinhole { focal_px, principal_px } = request.projection else {
             return self.render_packed(request, packing).map(QueuedPicture::ready);
         };
-        if self.recorder.gpu.is_software() {
+        if !self.renderer.may_pack(&mut self.recorder, packing, request.size_px)? {
             return self.render_packed(request, packing).map(QueuedPicture::ready);
         }
         let camera = Camera::from_request(request, focal_px, principal_px);

@@ -535,7 +535,7 @@ fn buffer_overflow_does_not_change_the_result() {
 /// Pictures are queued before any of them is read. The first ones do not fit into the buffers.
 #[test]
 fn queued_pictures_equal_rendered_ones() {
-    const MAX_MEAN_DIFFERENCE: f64 = 1.0; // Of JPEG at quality 95, in 255ths.
+    const MAX_MEAN_DIFFERENCE: f64 = 1.0; // JPEG error at quality 95, in units of 1/255.
     let gpu = Gpu::open(&GpuOptions::default()).unwrap();
     let mut cloud = synthetic_cloud(2000, 5);
     cloud.log_scales.fill([1.5; 3]); // Every splat covers every image, which overflows the buffers.

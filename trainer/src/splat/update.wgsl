@@ -112,7 +112,7 @@ struct CameraGradient {
 
 // Splats with more intersections are summed by 32 lanes.
 const MAX_SLOTS_PER_LANE = 16u;
-const N_TEAMS = 8u;                           // of 32 lanes: 10 rows of slots for each part of the gradient
+const N_TEAMS = 8u;                           // of 32 lanes; 30 of them read 10 slots at once, one gradient part per lane
 const TEAM_ROWS = 10u;
 var<workgroup> wg_n_large: atomic<u32>;
 var<workgroup> wg_n_large_read: u32;

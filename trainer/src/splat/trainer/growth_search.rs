@@ -22,8 +22,16 @@ use calibration::{Candidate, MIN_VALIDATION_IMAGES};
 use std::collections::VecDeque;
 
 impl SplatTrainer {
-    /// Number of images that the model is trained on in the end. Both halves of a trial have the same number at each step,
-    /// so validation images that arrive during a trial do not count.
+    /// Adapts the search to a change of the images, unless a trial is running, whose halves must be trained alike.
+    pub(super) fn update_growth_search(&mut self) {
+        if self.trials.running_trial().is_none() {
+            self.growth_search.postpone(self.schedule.step);
+            self.growth_search.set_n_images(self.n_images());
+        }
+    }
+
+    /// Number of training and validation images. During a trial, validation images that arrive do not count, because both
+    /// halves must have the same number at each step.
     pub(super) fn n_images(&self) -> usize {
         let n_validation = match self.trials.running_trial() {
             Some(trial) => trial.scored.len(),
@@ -36,8 +44,9 @@ impl SplatTrainer {
     pub(super) fn is_growth_search_due(&self) -> bool {
         match &self.growth_search {
             GrowthSearch::Running(models) => self.schedule.step >= models.until,
-            GrowthSearch::Waiting => {
-                self.schedule.step >= SEARCH_START
+            GrowthSearch::Waiting { not_before } => {
+                self.schedule.step >= SEARCH_START.max(*not_before)
+                    && self.views.len() >= 2
                     && !self.schedule.is_mature()
                     && self.trials.running_trial().is_none()
                     && self.model.splats.n_splats < self.options.cap()
@@ -57,7 +66,9 @@ impl SplatTrainer {
         };
         match advanced {
             Err(error) if error.is_out_of_memory() => {
-                log::warn!("stopped testing the number of splats: {error}");
+                log::warn!(
+                    "cross-validation stopped, so the number of splats is limited only by --max-splats: {error}"
+                );
                 self.abort_growth_search()?;
                 self.growth_search = GrowthSearch::Off;
                 Ok(())
@@ -70,6 +81,7 @@ impl SplatTrainer {
     pub(super) fn abort_growth_search(&mut self) -> Result<(), Error> {
         let Some(models) = self.growth_search.abort() else { return Ok(()) };
         self.views.hold_out(&[]);
+        self.model.set_full(models.is_main_full);
         self.restore_snapshot(models.main)
     }
 
@@ -88,6 +100,7 @@ impl SplatTrainer {
             phase: FoldPhase::WarmUp,
             until,
             n_splats,
+            is_main_full: self.model.is_full(),
             fork: None,
             previous: VecDeque::new(),
             doubled: VecDeque::new(),
@@ -147,7 +160,12 @@ impl SplatTrainer {
         let (n_more, step) = (self.model.splats.n_splats, self.schedule.step);
         self.schedule.last_growth_step = step;
         let key = growth_key(self.options.common.seed, step);
-        self.model.grow(&mut self.recorder, &mut self.renderer, &learn, n_more, key)
+        self.model.grow(&mut self.recorder, &mut self.renderer, &learn, n_more, key)?;
+        let n_splats = self.model.splats.n_splats;
+        if n_splats < n_more.saturating_mul(2).min(self.options.cap()) {
+            return Err(Error::OutOfMemory { label: "splat.doubled".to_owned(), bytes: 0 });
+        }
+        Ok(())
     }
 
     /// Scores the model with twice the number of splats. Continues with the next fold, or decides.

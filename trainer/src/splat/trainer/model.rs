@@ -126,6 +126,16 @@ impl TrainedModel {
         Ok(())
     }
 
+    /// Whether GPU memory is too small for more splats.
+    pub(super) fn is_full(&self) -> bool {
+        self.is_full
+    }
+
+    /// Restores the result of [`Self::is_full`].
+    pub(super) fn set_full(&mut self, is_full: bool) {
+        self.is_full = is_full;
+    }
+
     fn stop_growing(&mut self, error: &Error) {
         if !std::mem::replace(&mut self.is_full, true) {
             log::warn!("the model stops growing at {} splats: {error}", self.splats.n_splats);

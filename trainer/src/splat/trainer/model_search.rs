@@ -99,11 +99,18 @@ impl SplatTrainer {
             self.restore_snapshot(snapshot)?;
             seeded.into_iter().for_each(|keyframe| self.views.push(keyframe));
         }
-        deferred.into_iter().try_for_each(|keyframe| self.add_arrival(keyframe))
+        deferred.into_iter().try_for_each(|keyframe| self.add_arrival(keyframe))?;
+        self.update_growth_search();
+        Ok(())
     }
 
     /// Cancels a growth search, or a trial that is in its second half.
     pub(super) fn cancel_trial(&mut self) -> Result<(), Error> {
+        if self.growth_search.running().is_some() {
+            log::warn!(
+                "training stopped while the number of splats was tested; more time or --count to-cap gives a better model"
+            );
+        }
         self.abort_growth_search()?;
         let Some(canceled) = self.trials.cancel() else { return Ok(()) };
         log::info!("training stopped during a trial; saving the model without the tested change");

@@ -1,7 +1,7 @@
 //! Corrects the cameras of a model in training: the splats move along with the keyframes that show them.
 //!
-//! For each keyframe, the correction moves the point that the keyframe shows at a pixel and depth. A splat moves to the mean
-//! of these points over the keyframes that show it. A keyframe has more weight the better its depth agrees with the splat.
+//! A correction moves every point that a keyframe observes. A splat moves by the weighted mean of these motions over the
+//! keyframes that observe it. The better a keyframe's depth agrees with the splat, the higher its weight.
 //! Coefficients of spherical harmonics are not rotated, because corrections are a few degrees at most.
 
 use super::SplatTrainer;

@@ -67,7 +67,8 @@ impl Renderer {
         drawn: DrawnView<'_>,
         output: Output,
     ) -> Result<Rendered, Error> {
-        let (size_px, output) = (drawn.camera.size_px, output.on(&recorder.gpu));
+        let size_px = drawn.camera.size_px;
+        let output = self.packer.available(&recorder.gpu, &mut recorder.passes, output, size_px)?;
         let take = |parts: &[&[u8]]| match output {
             Output::Picture { .. } => Some(Rendered::Picture(Picture::from_parts(size_px, parts))),
             Output::Packed(packing) => packing::unpack(packing, size_px, parts).map(Rendered::Packed),
@@ -114,6 +115,17 @@ impl Renderer {
         let products = self.compare(recorder, drawn, score, &image)?;
         self.compared = Some(image);
         Ok(products)
+    }
+
+    /// Whether pictures of this size can be packed.
+    pub(super) fn may_pack(
+        &mut self,
+        recorder: &mut Recorder,
+        packing: Packing,
+        size_px: [u32; 2],
+    ) -> Result<bool, Error> {
+        let output = self.packer.available(&recorder.gpu, &mut recorder.passes, Output::Packed(packing), size_px)?;
+        Ok(matches!(output, Output::Packed(_)))
     }
 
     /// Starts to draw and pack a picture.

@@ -61,7 +61,7 @@ impl SplatTrainer {
         let place = self.views.of_step(self.schedule.step);
         let counts = self.work_counts(self.views.size_px(place))?;
         log::info!(
-            "splat: {} splats in tiles, {} of them visible; longest list {}, {} of them visible; largest splat touches {} tiles",
+            "splat: {} intersections of splats and tiles, {} visible; longest tile list {}, most visible in one tile {}; largest splat touches {} tiles",
             counts.n_intersections,
             counts.n_visible,
             counts.longest_list,

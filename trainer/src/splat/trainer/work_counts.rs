@@ -12,9 +12,9 @@ pub(super) struct WorkCounts {
     pub(super) n_intersections: u64,
     /// Intersections up to the last splat that contributes to a pixel of the tile.
     pub(super) n_visible: u64,
-    /// Intersections of the tile with the most.
+    /// Length of the longest tile list.
     pub(super) longest_list: u64,
-    /// Visible intersections of the tile with the most.
+    /// Maximum number of visible intersections in a tile; not necessarily the tile of `longest_list`.
     pub(super) longest_visible: u64,
     /// Tiles that the largest splat touches.
     pub(super) largest_splat: u64,
