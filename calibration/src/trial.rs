@@ -19,6 +19,8 @@ pub enum CameraRefinement {
     Always(ParamSet),
     /// Tries each of these sets in turn and keeps it if the gain is significant.
     Try(Vec<ParamSet>),
+    /// Optimizes the first set from the first step on, and tries each of the others.
+    AlwaysAndTry(ParamSet, Vec<ParamSet>),
 }
 
 impl Default for CameraRefinement {
@@ -30,12 +32,18 @@ impl Default for CameraRefinement {
 impl CameraRefinement {
     /// The parameters that are optimized without a trial.
     pub fn always(&self) -> ParamSet {
-        if let Self::Always(params) = self { *params } else { ParamSet::empty() }
+        match self {
+            Self::Always(params) | Self::AlwaysAndTry(params, _) => *params,
+            Self::Try(_) => ParamSet::empty(),
+        }
     }
 
     /// The sets of parameters to try, in this order.
     pub fn candidates(&self) -> &[ParamSet] {
-        if let Self::Try(candidates) = self { candidates } else { &[] }
+        match self {
+            Self::Try(candidates) | Self::AlwaysAndTry(_, candidates) => candidates,
+            Self::Always(_) => &[],
+        }
     }
 }
 

@@ -99,7 +99,13 @@ pub struct AvailableData {
     pub drifts: bool,
     /// Whether keyframes have depth.
     pub depth: bool,
+    /// Whether cameras have at least [`MIN_IMAGES_PER_CAMERA`] images on average. With fewer, the extrinsics of a camera are
+    /// hardly different from the poses of its images.
+    pub many_images_per_camera: bool,
 }
+
+/// Minimum average number of images per camera for the optimization of extrinsics by default.
+pub(crate) const MIN_IMAGES_PER_CAMERA: usize = 10;
 
 impl TrainingOptions {
     /// The requested scene models; `None` if the flag is not given.
@@ -126,7 +132,7 @@ impl TrainingOptions {
 
     /// Rejects flags that are invalid for any data, before the data is read.
     pub fn check_before_data(&self, kinds: &[ModelKind], joints: bool) -> Result<(), Error> {
-        let all_available = AvailableData { joints, drifts: true, depth: true };
+        let all_available = AvailableData { joints, drifts: true, depth: true, many_images_per_camera: true };
         self.check_for(kinds)?;
         self.refining(all_available, Refine::None)?;
         self.check_learned(kinds, all_available)
@@ -183,13 +189,14 @@ impl TrainingOptions {
         })
     }
 
-    /// Which calibration parameters a live run estimates. Without the flag, these are all that registration can
-    /// estimate, or none on a software adapter, where training is already slow.
+    /// Which calibration parameters a live run estimates. Without the flag, these are all that registration can estimate, and
+    /// extrinsics if there is no depth; or none on a software adapter, where training is already slow.
     pub fn refining_live(&self, available: AvailableData, software: bool) -> Result<RefineSettings, Error> {
         if !self.refine.is_empty() || software {
             return self.refining(available, Refine::None);
         }
-        Ok(RefineSettings { with_scene: CameraRefinement::default(), ..available.auto_settings() })
+        let settings = available.auto_settings();
+        Ok(RefineSettings { with_scene: CameraRefinement::Always(settings.with_scene.always()), ..settings })
     }
 
     /// The rig file keys that the flags override.
@@ -246,19 +253,24 @@ fn param_set(requested: &[Refine]) -> ParamSet {
 impl AvailableData {
     /// Candidates for trials, the most promising first. They are estimated by registration if there is depth, otherwise
     /// jointly with the scene.
+    ///
+    /// Without depth, extrinsics are optimized from the first step on: their error is shared by all images, so it is
+    /// observable if the poses are right, and a trial of a few hundred steps is too short to correct it.
     fn auto_settings(self) -> RefineSettings {
         let gains = ParamSet::IMAGE_GAINS;
         let poses = ParamSet::IMAGE_POSES;
         let with_scene = match self {
             Self { drifts: true, .. } => vec![gains, poses],
             Self { depth: true, .. } => vec![gains],
-            Self { depth: false, .. } => {
-                vec![gains, ParamSet::EXTRINSICS | ParamSet::TIME_OFFSET]
-            }
+            Self { depth: false, many_images_per_camera: true, .. } => vec![gains, ParamSet::TIME_OFFSET],
+            Self { depth: false, .. } => vec![gains, ParamSet::EXTRINSICS | ParamSet::TIME_OFFSET],
         };
         RefineSettings {
             align: CameraRefinement::Try(if self.depth { candidates() } else { Vec::new() }),
-            with_scene: CameraRefinement::Try(with_scene),
+            with_scene: match self.many_images_per_camera && !self.depth {
+                true => CameraRefinement::AlwaysAndTry(ParamSet::EXTRINSICS, with_scene),
+                false => CameraRefinement::Try(with_scene),
+            },
         }
     }
 }
@@ -274,7 +286,7 @@ mod tests {
     fn refining(requested: &[Refine], joints: bool, depth: bool) -> Result<RefineSettings, String> {
         let options = TrainingOptions { refine: requested.to_vec(), ..TrainingOptions::default() };
         options
-            .refining(AvailableData { joints, drifts: !joints, depth }, Refine::None)
+            .refining(AvailableData { joints, drifts: !joints, depth, many_images_per_camera: true }, Refine::None)
             .map_err(|error| error.to_string())
     }
 
@@ -290,10 +302,7 @@ mod tests {
             RefineSettings { align: CameraRefinement::default(), with_scene: CameraRefinement::Always(extrinsics) }
         );
 
-        let candidates = |choice: CameraRefinement| match choice {
-            CameraRefinement::Try(candidates) => candidates.len(),
-            CameraRefinement::Always(_) => panic!("auto tries"),
-        };
+        let candidates = |choice: CameraRefinement| choice.candidates().len();
         for (joints, depth, aligned, learned) in
             [(true, true, 8, 1), (true, false, 0, 2), (false, true, 8, 2), (false, false, 0, 2)]
         {
@@ -304,6 +313,17 @@ mod tests {
                 "joints {joints}, depth {depth}"
             );
         }
+        for (joints, depth, many_images_per_camera, always) in [
+            (true, false, true, extrinsics),
+            (false, false, true, extrinsics),
+            (true, true, true, ParamSet::empty()),
+            (false, false, false, ParamSet::empty()),
+        ] {
+            let available = AvailableData { joints, drifts: !joints, depth, many_images_per_camera };
+            let options = TrainingOptions::default();
+            assert_eq!(options.refining(available, Refine::Auto).unwrap().with_scene.always(), always);
+            assert_eq!(options.refining_live(available, false).unwrap().with_scene, CameraRefinement::Always(always));
+        }
         assert_eq!(refining(&[], true, true), Ok(RefineSettings::default()));
     }
 
@@ -311,7 +331,7 @@ mod tests {
     fn unsupported_flags_are_rejected_for_each_method() {
         let options =
             TrainingOptions { max_splats: Some(5), refine: vec![Refine::ImageGains], ..TrainingOptions::default() };
-        let available = AvailableData { joints: true, drifts: false, depth: true };
+        let available = AvailableData { joints: true, drifts: false, depth: true, many_images_per_camera: true };
         let both = [kind("tsdf"), kind("splat")];
         assert!(options.check_for(&both).is_ok() && options.check_learned(&both, available).is_ok());
         let message = options.check_for(&[kind("tsdf"), kind("nerf")]).unwrap_err().to_string();

@@ -94,6 +94,10 @@ pub fn align(keyframes: &[Arc<Keyframe>], choice: &CameraRefinement) -> Option<A
         CameraRefinement::Try(candidates) => {
             scene.select_params(candidates, uncorrected, &mut trials, &mut unobservable)
         }
+        CameraRefinement::AlwaysAndTry(set, candidates) => {
+            let all = [&[*set], &candidates[..]].concat(); // Registration has no first step, so it tries every set.
+            scene.select_params(&all, uncorrected, &mut trials, &mut unobservable)
+        }
     };
     if let Some(fit) = &kept.fit {
         unobservable.extend(report::unobservable(&scene, fit));

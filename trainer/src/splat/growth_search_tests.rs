@@ -102,7 +102,9 @@ fn interrupted_search_is_repeated() {
     let gpu = Gpu::open(&GpuOptions::default()).unwrap();
     let keyframes = without_validation(n_keyframes(&gpu, 12, true));
     let start_search = || {
-        let mut trainer = new_trainer(&gpu, tested(), &keyframes[..11]);
+        // The repeated search starts before growth ends.
+        let options = tested().with(|options| options.common.n_planned_steps = 2 * N_PLANNED_STEPS);
+        let mut trainer = new_trainer(&gpu, options, &keyframes[..11]);
         train(&mut trainer, SEARCH_START);
         let n_before = trainer.progress().primitives;
         trainer.step(30).unwrap();
