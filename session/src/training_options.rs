@@ -99,7 +99,7 @@ pub struct AvailableData {
     pub drifts: bool,
     /// Whether keyframes have depth.
     pub depth: bool,
-    /// Whether cameras have at least [`MIN_IMAGES_PER_CAMERA`] images on average. With fewer, the extrinsics of a camera are
+    /// Whether cameras have at least 10 images on average. With fewer, the extrinsics of a camera are
     /// hardly different from the poses of its images.
     pub many_images_per_camera: bool,
 }
