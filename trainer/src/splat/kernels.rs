@@ -177,6 +177,18 @@ pub(crate) const KERNELS: &[Kernel] = &[
     kernel!("gather"),
 ];
 
+/// Creates `Self` from fields that are computed as given, and from pipelines, which are compiled in parallel to them.
+macro_rules! compile {
+    ($gpu:expr, { $($given:ident: $value:expr),* $(,)? }, { $($field:ident: $kernel:expr, $overrides:expr);* $(;)? }) => {{
+        let others = || -> Result<_, Error> { Ok(($($value),*)) };
+        let compile = || Pipeline::compile_all($gpu, [$(($kernel, &$overrides[..])),*]);
+        let (others, compiled) = rayon::join(others, compile);
+        let ($($given),*) = others?;
+        let [$($field),*] = compiled?;
+        Ok(Self { $($given,)* $($field),* })
+    }};
+}
+
 /// Pipelines for drawing.
 #[derive(Debug)]
 pub(crate) struct DrawPipelines {
@@ -197,37 +209,19 @@ pub(crate) struct DrawPipelines {
 impl DrawPipelines {
     pub(crate) fn new(gpu: &Gpu) -> Result<Self, Error> {
         let blend = blend(gpu);
-        let compile = || {
-            Pipeline::compile_all(
-                gpu,
-                [
-                    kernel!("project"),
-                    kernel!("count_bins"),
-                    kernel!("sum_bins"),
-                    kernel!("scan_bins"),
-                    kernel!("allocate"),
-                    kernel!("emit"),
-                    kernel!("tile_bits"),
-                    blend.rasterize,
-                    kernel!("finish"),
-                ]
-                .map(|kernel| (kernel, &[][..])),
-            )
-        };
-        let (sort, compiled) = rayon::join(|| RadixSort::new(gpu), compile);
-        let [project, count_bins, sum_bins, scan_bins, allocate, emit, tile_bits, rasterize, finish] = compiled?;
-        Ok(Self {
-            sort: sort?,
-            project,
-            count_bins,
-            sum_bins,
-            scan_bins,
-            allocate,
-            emit,
-            tile_bits,
-            rasterize,
-            finish,
+        compile!(gpu, {
+            sort: RadixSort::new(gpu)?,
             has_segments: blend.rasterize_segments.is_some(),
+        }, {
+            project: kernel!("project"), &[];
+            count_bins: kernel!("count_bins"), &[];
+            sum_bins: kernel!("sum_bins"), &[];
+            scan_bins: kernel!("scan_bins"), &[];
+            allocate: kernel!("allocate"), &[];
+            emit: kernel!("emit"), &[];
+            tile_bits: kernel!("tile_bits"), &[];
+            rasterize: blend.rasterize, &[];
+            finish: kernel!("finish"), &[];
         })
     }
 }
@@ -244,6 +238,18 @@ pub(crate) enum Ssim {
         /// Propagates these gradients to the pixels, for `loss`.
         upstream: Pipeline,
     },
+}
+
+impl Ssim {
+    fn new(gpu: &Gpu, in_strips: bool) -> Result<Self, Error> {
+        if !in_strips {
+            return Ok(Self::Tiles(Pipeline::new(gpu, kernel!("loss", "ssim", SHARED), &[])?));
+        }
+        Ok(Self::Strips {
+            means: Pipeline::new(gpu, kernel!("loss", "ssim_strips", LOSS_STRIPS), &[])?,
+            upstream: Pipeline::new(gpu, kernel!("loss", "ssim_upstream_strips", LOSS_STRIPS), &[])?,
+        })
+    }
 }
 
 /// Additional pipelines for training.
@@ -275,76 +281,25 @@ impl TrainPipelines {
         let lanes: Vec<_> = blend.subgroup.map(|lanes| ("SUBGROUP", f64::from(lanes))).into_iter().collect();
         let in_strips = blend.rasterize_segments.is_none();
         let loss = kernel!("loss", "loss_backward", if in_strips { LOSS_STRIPS } else { SHARED });
-        let by_adapter = || -> Result<_, Error> {
-            let ssim = if in_strips {
-                Ssim::Strips {
-                    means: Pipeline::new(gpu, kernel!("loss", "ssim_strips", LOSS_STRIPS), &[])?,
-                    upstream: Pipeline::new(gpu, kernel!("loss", "ssim_upstream_strips", LOSS_STRIPS), &[])?,
-                }
-            } else {
-                Ssim::Tiles(Pipeline::new(gpu, kernel!("loss", "ssim", SHARED), &[])?)
-            };
-            Ok((ssim, blend.rasterize_segments.map(|kernel| Pipeline::new(gpu, kernel, &[])).transpose()?))
-        };
-        let compile = || {
-            Pipeline::compile_all(
-                gpu,
-                [
-                    (loss, &[("SSIM", 1.0)][..]),
-                    (loss, &[("SSIM", 0.0)]),
-                    (blend.backward, &lanes),
-                    (kernel!("update"), &[]),
-                    (kernel!("update", WITH_CAMERA), &[]),
-                    (kernel!("correct_view"), &[]),
-                    (kernel!("refine_camera"), &[]),
-                    (kernel!("advance"), &[]),
-                    (kernel!("grow_weigh"), &[]),
-                    (kernel!("grow_scan"), &[]),
-                    (kernel!("grow_child"), &[]),
-                    (kernel!("grow_family"), &[]),
-                    (kernel!("score"), &[]),
-                    (kernel!("contribute"), &[]),
-                    (kernel!("gather"), &[]),
-                ],
-            )
-        };
-        let (by_adapter, compiled) = rayon::join(by_adapter, compile);
-        let (ssim, rasterize_segments) = by_adapter?;
-        let [
-            loss,
-            loss_without_ssim,
-            backward,
-            update,
-            update_with_camera,
-            correct_view,
-            refine_camera,
-            advance,
-            grow_weigh,
-            grow_scan,
-            grow_child,
-            grow_family,
-            score,
-            contribute,
-            gather,
-        ] = compiled?;
-        Ok(Self {
-            ssim,
-            loss,
-            loss_without_ssim,
-            rasterize_segments,
-            backward,
-            update,
-            update_with_camera,
-            correct_view,
-            refine_camera,
-            advance,
-            grow_weigh,
-            grow_scan,
-            grow_child,
-            grow_family,
-            score,
-            contribute,
-            gather,
+        compile!(gpu, {
+            ssim: Ssim::new(gpu, in_strips)?,
+            rasterize_segments: blend.rasterize_segments.map(|kernel| Pipeline::new(gpu, kernel, &[])).transpose()?,
+        }, {
+            loss: loss, &[("SSIM", 1.0)];
+            loss_without_ssim: loss, &[("SSIM", 0.0)];
+            backward: blend.backward, &lanes;
+            update: kernel!("update"), &[];
+            update_with_camera: kernel!("update", WITH_CAMERA), &[];
+            correct_view: kernel!("correct_view"), &[];
+            refine_camera: kernel!("refine_camera"), &[];
+            advance: kernel!("advance"), &[];
+            grow_weigh: kernel!("grow_weigh"), &[];
+            grow_scan: kernel!("grow_scan"), &[];
+            grow_child: kernel!("grow_child"), &[];
+            grow_family: kernel!("grow_family"), &[];
+            score: kernel!("score"), &[];
+            contribute: kernel!("contribute"), &[];
+            gather: kernel!("gather"), &[];
         })
     }
 

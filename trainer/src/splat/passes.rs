@@ -140,9 +140,9 @@ impl ViewPasses<'_> {
         passes.dispatch(self.gpu, rasterize, u64::from(n_tiles(self.size_px)), &buffers);
     }
 
-    /// Buffers of `rasterize`.
-    fn rasterized(&self) -> [(&'static str, &Buffer); 9] {
-        let Self { scratch, image_buffers, .. } = *self;
+    /// Buffers of shared/tile.wgsl, and the buffer `last`.
+    fn lists(&self) -> [(&'static str, &Buffer); 7] {
+        let scratch = self.scratch;
         [
             ("view", self.view),
             ("status", self.status),
@@ -150,10 +150,14 @@ impl ViewPasses<'_> {
             ("tile_bits", &scratch.tile_bits),
             ("entries", &scratch.entries),
             ("projected_splats", &scratch.projected_splats),
-            ("image", &image_buffers.image),
-            ("depth", &image_buffers.depth),
-            ("last", &image_buffers.last),
+            ("last", &self.image_buffers.last),
         ]
+    }
+
+    /// Buffers of `rasterize`.
+    fn rasterized(&self) -> Vec<(&'static str, &Buffer)> {
+        let ImageBuffers { image, depth, .. } = self.image_buffers;
+        [&self.lists()[..], &[("image", image), ("depth", depth)]].concat()
     }
 
     /// Buffers of the segments of the lists.
@@ -310,18 +314,12 @@ impl ViewPasses<'_> {
     pub(crate) fn backward(&self, passes: &mut Passes, pipelines: &TrainPipelines) {
         let Self { gpu, scratch, image_buffers, .. } = *self;
         let n_tiles = u64::from(n_tiles(self.size_px));
-        let mut buffers = vec![
-            ("view", self.view),
-            ("status", self.status),
-            ("bin_starts", &scratch.bin_starts),
-            ("tile_bits", &scratch.tile_bits),
-            ("entries", &scratch.entries),
-            ("projected_splats", &scratch.projected_splats),
+        let mut buffers = self.lists().to_vec();
+        buffers.extend([
             ("upstream", &image_buffers.upstream),
             ("pixel_totals", &image_buffers.pixel_totals),
-            ("last", &image_buffers.last),
             ("gradients", &scratch.gradients),
-        ];
+        ]);
         let mut n_groups = n_tiles;
         if pipelines.rasterize_segments.is_some() {
             buffers.extend(self.segments());
