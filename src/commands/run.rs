@@ -286,7 +286,7 @@ pub(super) fn start(
     let gpu = open_gpu()?;
     let RefineSettings { align, with_scene: cameras } = training.refining_live(available, gpu.is_software())?;
     let common = CommonOptions { cameras, align, align_timing: pace.align_timing(), ..common };
-    let models: Vec<Resumed> = match previous {
+    let mut models: Vec<Resumed> = match previous {
         Some(previous) => vec![trainer::resume(gpu.clone(), &previous.checkpoint, &previous.keyframes)?],
         None => {
             let start = |model_spec: ModelSpec| {
@@ -302,6 +302,8 @@ pub(super) fn start(
     for finding in doctor::suspicious_values(&rig) {
         log::warn!("{finding}");
     }
+    // Before the first image, so that keyframes do not wait for the compiler.
+    models.iter_mut().try_for_each(|model| model.method.prepare())?;
     let Opened { rig, source, damage, stamp_clock } = args.open(rig)?;
     args.print_address(&server.url())?;
     let folders = created.make_each(args.out(), &kinds, Some(&rig))?;

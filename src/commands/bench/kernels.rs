@@ -67,12 +67,13 @@ impl Args {
             return print::json(row);
         }
         print::line(format_args!(
-            "{}x{} {:>8} splats {:>9} intersections: image {:.3} ms, step {:.3} ms (wall {:.3}, {:.3}; only the {} visible splats {:.3} ms), mean {:.5?}, peak {} MB",
+            "{}x{} {:>8} splats {:>9} intersections: image {:.3} ms, packed {:.3}, step {:.3} ms (wall {:.3}, {:.3}; only the {} visible splats {:.3} ms), mean {:.5?}, peak {} MB",
             row.size_px[0],
             row.size_px[1],
             row.n_splats,
             row.figures.n_intersections,
             row.figures.render_millis,
+            row.figures.packed_millis.unwrap_or(f64::NAN),
             row.figures.step_millis,
             row.figures.render_wall_millis,
             row.figures.step_wall_millis,

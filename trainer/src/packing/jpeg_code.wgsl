@@ -1,6 +1,6 @@
 // jpeg_code: Huffman codes of each restart interval.
 //
-// threads   one per interval, 64 per workgroup
+// threads   one per interval, 32 per workgroup
 // reads     packing, coefficients [n_mcus, 3, 64], non_zero [n_mcus, 3, 2], codes [544] (see tables.rs)
 // writes    coded [n_intervals, words_per_interval], n_coded [n_intervals] (words), packed (OVERFLOW)
 // source    ITU-T T.81, section F.1.2; restart intervals in parallel as in GPUJPEG (Holub et al. 2013)
@@ -66,9 +66,9 @@ fn put_value(writer: ptr<function, Writer>, code: u32, value: i32) {
     put_bits(writer, u32(value - select(0, 1, value < 0)) & ((1u << n_bits) - 1u), n_bits);
 }
 
-@compute @workgroup_size(64)
+@compute @workgroup_size(32)
 fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
-    let interval = folded(wg, n_wgs) * 64u + lane;
+    let interval = folded(wg, n_wgs) * 32u + lane;
     if interval >= packing.n_intervals { return; } // Allowed here: no barrier below.
     let n_mcus = packing.n_mcus.x * packing.n_mcus.y;
     let begin = interval * packing.mcus_per_interval;

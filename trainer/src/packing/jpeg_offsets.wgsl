@@ -13,17 +13,21 @@
 
 @compute @workgroup_size(256)
 fn main(@builtin(local_invocation_index) lane: u32) {
-    var before = 0u;
-    for (var first = 0u; first < packing.n_intervals; first += 256u) {
-        var n_words = 0u;
-        if first + lane < packing.n_intervals { n_words = n_coded[first + lane]; }
-        var total = 0u;
-        let offset = exclusive_scan(lane, n_words, &total);
-        if first + lane < packing.n_intervals { n_coded[first + lane] = before + offset; }
-        before += total;
+    // Each lane handles neighboring intervals, so that one scan suffices.
+    let n_per_lane = (packing.n_intervals + 255u) / 256u;
+    let first = min(lane * n_per_lane, packing.n_intervals);
+    let end = min(first + n_per_lane, packing.n_intervals);
+    var n_words = 0u;
+    for (var interval = first; interval < end; interval++) { n_words += n_coded[interval]; }
+    var total = 0u;
+    var offset = exclusive_scan(lane, n_words, &total);
+    for (var interval = first; interval < end; interval++) {
+        let n = n_coded[interval];
+        n_coded[interval] = offset;
+        offset += n;
     }
     if lane == 0u {
-        packed[TOTAL_WORDS] = before;
-        if before > packing.n_words { packed[OVERFLOW] = 1u; }
+        packed[TOTAL_WORDS] = total;
+        if total > packing.n_words { packed[OVERFLOW] = 1u; }
     }
 }

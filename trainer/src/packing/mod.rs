@@ -8,9 +8,9 @@ use crate::view::{Camera, projections};
 use crate::{Error, Picture, Projection, RenderRequest};
 
 /// MCUs (8 x 8 pixels, no subsampling) per restart interval, which one lane encodes.
-const MCUS_PER_INTERVAL: u32 = 8;
-/// Capacity of an interval, in words: twice the average of a file of [`WORDS_PER_MCU`].
-const WORDS_PER_INTERVAL: u32 = 2 * WORDS_PER_MCU * MCUS_PER_INTERVAL;
+const MCUS_PER_INTERVAL: u32 = 2;
+/// Capacity of an interval, in words: four times the average of a file of [`WORDS_PER_MCU`].
+const WORDS_PER_INTERVAL: u32 = 4 * WORDS_PER_MCU * MCUS_PER_INTERVAL;
 /// Maximum average of coded words per MCU. At quality 92, pictures of splats need about 6.
 const WORDS_PER_MCU: u32 = 16;
 /// Words before the coded words.
@@ -331,9 +331,9 @@ impl Packer {
             let transformed = [uniform, ("pixels", pixels), ("tables", tables), coefficients, non_zero];
             passes.dispatch(gpu, transform, sizes.n_mcus().into(), &transformed);
             let encoded = [uniform, coefficients, non_zero, ("codes", &*codes), coded, n_coded, packed];
-            passes.dispatch(gpu, code, n_intervals.div_ceil(64), &encoded);
+            passes.dispatch(gpu, code, n_intervals.div_ceil(32), &encoded);
             passes.dispatch(gpu, offsets, 1, &[uniform, n_coded, packed]);
-            passes.dispatch(gpu, join, n_intervals, &[uniform, coded, n_coded, packed]);
+            passes.dispatch(gpu, join, n_intervals.div_ceil(8), &[uniform, coded, n_coded, packed]);
         }
         let mut reads = vec![(packed.1, 4 * n_words as usize)];
         if packing.depth {

@@ -79,7 +79,7 @@ impl KernelFixture {
         let scratch = Scratch::new(
             &gpu,
             &draw,
-            ScratchSize { n_splats, n_entries: 1 << 14, n_slots: 1 << 14, n_bins: n_bins(view.size_px) },
+            ScratchSize { n_splats, n_entries: 1 << 15, n_slots: 1 << 17, n_bins: n_bins(view.size_px) },
         )
         .unwrap();
         let image_buffers = ImageBuffers::new(&gpu, view.size_px[0] * view.size_px[1], tiles, true).unwrap();
@@ -214,6 +214,24 @@ fn gradients_match_the_twin() {
 /// Lists of several segments, of splats that touch more tiles than one lane of `update` sums.
 #[test]
 fn gradients_of_long_lists_match_the_twin() {
+    let (view, splats) = long_lists(400, 2.5, -4.4);
+    check_gradients_with_loss(&view, &splats);
+}
+
+/// Pixels that end in different segments of the same list.
+#[test]
+fn pixels_that_end_in_long_lists_match_the_twin() {
+    let (view, splats) = long_lists(1000, 0.5, -3.7);
+    let mut n_contributors: Vec<usize> = reference::decide(&view, &splats).contributors.iter().map(Vec::len).collect();
+    n_contributors.sort_unstable();
+    let n_pixels = n_contributors.len();
+    let [low, high] = [n_contributors[n_pixels / 10], n_contributors[n_pixels * 9 / 10]];
+    assert!(low > 256 && high > low + 100 && high < 900, "{low} to {high} splats per pixel");
+    check_gradients_with_loss(&view, &splats);
+}
+
+/// Splats with about the given logarithm of their size in meters and logit of their opacity.
+fn long_lists(n: usize, log_scale: f64, opacity_logit: f64) -> (View, Vec<Splat>) {
     let view = scene::tilted_view();
     let view = View {
         focal_px: view.focal_px.map(|focal_px| 4.0 * focal_px),
@@ -222,15 +240,15 @@ fn gradients_of_long_lists_match_the_twin() {
         ..view
     };
     let world_from_camera = view.camera_from_world.inverse();
-    let mut splats = scene::small_scene(5, 400);
+    let mut splats = scene::small_scene(5, n);
     for (ix, splat) in splats.iter_mut().enumerate() {
         // Depths that differ, in an order unlike that of the indices.
-        let z = 1.5 + 0.0025 * (ix * 149 % 400) as f64;
+        let z = 1.5 + 0.0025 * (ix * 149 % n) as f64;
         splat.mean = (world_from_camera * nalgebra::Point3::new(splat.mean[0], splat.mean[1], z)).coords.into();
-        splat.log_scale = splat.log_scale.map(|log_scale| 2.5 + 0.5 * log_scale); // Far larger than the image.
-        splat.opacity_logit = -4.4 + 0.1 * splat.opacity_logit;
+        splat.log_scale = splat.log_scale.map(|variation| log_scale + 0.5 * variation);
+        splat.opacity_logit = opacity_logit + 0.1 * splat.opacity_logit;
     }
-    check_gradients_with_loss(&view, &splats);
+    (view, splats)
 }
 
 /// Compares the gradients of a loss with color, D-SSIM and depth, for both kernel variants.

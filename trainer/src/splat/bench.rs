@@ -8,14 +8,18 @@ use super::buffers::{ImageBuffers, Scratch, ScratchSize, SplatBuffers, n_bins, n
 use super::kernels::{DrawPipelines, TrainPipelines};
 use super::params::{Camera, LOW_PASS_PX2, Rule, Supervision, status};
 use super::passes::{Target, ViewPasses};
-use crate::Error;
 use crate::gpu::{Buffer, Gpu, PassTiming, Passes, f32_of};
+use crate::packing::LazyPacker;
+use crate::{Error, Packing};
 use kinematics::Transform;
 use kinematics::quantile::{Rank, quantile};
 use serde::Serialize;
+use std::cell::RefCell;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+/// Quality of the JPEG files that viewers get.
+const JPEG_QUALITY: u8 = 92;
 /// Learning rate of every parameter. It is small, so that the cloud hardly changes.
 const RATE: f32 = 1e-5;
 
@@ -27,6 +31,9 @@ pub struct KernelFigures {
     /// Median GPU time of a picture, from the first pass to the last, milliseconds. Wall time if timestamps are
     /// unavailable.
     pub render_millis: f64,
+    /// Median GPU time of a picture that is also packed as JPEG and depth for a viewer, milliseconds; `None` on the
+    /// CPU, where pictures are not packed.
+    pub packed_millis: Option<f64>,
     /// Median GPU time of a step that updates every splat, milliseconds.
     pub step_millis: f64,
     /// Median GPU time of a step that updates only visible splats, milliseconds.
@@ -41,7 +48,7 @@ pub struct KernelFigures {
     pub mean_rgb: [f64; 3],
     /// Peak size of all GPU buffers, bytes.
     pub peak_bytes: u64,
-    /// GPU time of each pass of one step; empty without timestamps.
+    /// GPU time of each pass of one step, then of each pass that packs a picture; empty without timestamps.
     #[serde(skip)]
     pub passes: Vec<PassTiming>,
 }
@@ -77,6 +84,9 @@ pub struct Repeats {
     pub n_consecutive: usize,
 }
 
+/// Records passes to be timed.
+type Recorded = fn(&KernelBench, &mut Passes) -> Result<(), Error>;
+
 struct KernelBench {
     gpu: Arc<Gpu>,
     draw: DrawPipelines,
@@ -92,6 +102,7 @@ struct KernelBench {
     gains: Buffer,
     rule: Buffer,
     rule_visible: Buffer,
+    packer: RefCell<LazyPacker>,
     size_px: [u32; 2],
 }
 
@@ -110,14 +121,21 @@ pub fn time_kernels(
     let n_intersections = u64::from(bench.counters()?[status::NEED_SLOTS]);
     let (render_millis, render_wall_millis) = bench.time(&mut passes, repeats, KernelBench::record_picture)?;
     let (step_millis, step_wall_millis) = bench.time(&mut passes, repeats, KernelBench::record_step)?;
-    bench.record_step(&mut passes);
-    let timings = passes.submit_timed(gpu)?;
+    bench.record_step(&mut passes)?;
+    let mut timings = passes.submit_timed(gpu)?;
+    let mut packed_millis = None;
+    if !gpu.is_software() {
+        packed_millis = Some(bench.time(&mut passes, repeats, KernelBench::record_packed_picture)?.0);
+        bench.record_packing(&mut passes)?;
+        timings.extend(passes.submit_timed(gpu)?);
+    }
     let peak_bytes = gpu.peak_bytes();
     let (step_visible_millis, _) = bench.time(&mut passes, repeats, KernelBench::record_step_visible)?;
     let n_visible = bench.n_visible()?;
     Ok(KernelFigures {
         n_intersections,
         render_millis,
+        packed_millis,
         step_millis,
         step_visible_millis,
         n_visible,
@@ -168,6 +186,7 @@ impl KernelBench {
             gains: gpu.storage_with("bench.gains", bytemuck::cast_slice(&[1.0f32; 4]))?,
             rule: gpu.uniform_with("bench.rule", &rule()),
             rule_visible: gpu.uniform_with("bench.rule_touched", &Rule { update_all: 0, ..rule() }),
+            packer: RefCell::default(),
             draw,
             train,
             splats,
@@ -211,22 +230,39 @@ impl KernelBench {
         }
     }
 
-    fn record_picture(&self, passes: &mut Passes) {
+    fn record_picture(&self, passes: &mut Passes) -> Result<(), Error> {
         self.view_passes().draw(passes, &self.draw);
+        Ok(())
     }
 
-    fn record_step(&self, passes: &mut Passes) {
+    fn record_packed_picture(&self, passes: &mut Passes) -> Result<(), Error> {
+        self.record_picture(passes)?;
+        self.record_packing(passes)
+    }
+
+    /// Records the passes that convert and pack a picture.
+    fn record_packing(&self, passes: &mut Passes) -> Result<(), Error> {
+        self.view_passes().finish(passes, &self.draw, &self.supervision);
+        let ImageBuffers { pixels, depths, .. } = &self.image_buffers;
+        let packing = Packing { jpeg_quality: Some(JPEG_QUALITY), depth: true };
+        let mut packer = self.packer.borrow_mut();
+        packer.get(&self.gpu)?.record(&self.gpu, passes, packing, self.size_px, [pixels, depths]).map(drop)
+    }
+
+    fn record_step(&self, passes: &mut Passes) -> Result<(), Error> {
         let view = self.record_gradients(passes);
         view.backward(passes, &self.train);
         view.update(passes, &self.train.update, &self.rule, false);
         self.record_end(passes);
+        Ok(())
     }
 
-    fn record_step_visible(&self, passes: &mut Passes) {
+    fn record_step_visible(&self, passes: &mut Passes) -> Result<(), Error> {
         let view = self.record_gradients(passes);
         view.backward(passes, &self.train);
         view.update(passes, &self.train.update, &self.rule_visible, false);
         self.record_end(passes);
+        Ok(())
     }
 
     /// Records the passes that draw the picture and compare it with the target.
@@ -256,26 +292,26 @@ impl KernelBench {
         Ok(tile_counts.iter().filter(|n_tiles| **n_tiles > 0).count() as u64)
     }
 
-    fn time(&self, passes: &mut Passes, repeats: Repeats, record: fn(&Self, &mut Passes)) -> Result<(f64, f64), Error> {
+    fn time(&self, passes: &mut Passes, repeats: Repeats, record: Recorded) -> Result<(f64, f64), Error> {
         // Warm up, because some GPUs stay busy for tenths of a second after large buffers are freed.
         let warming = Instant::now();
         let mut n_warm = 0;
         while n_warm < repeats.n_warm_up || (warming.elapsed() < repeats.warm_up && n_warm < 100 * repeats.n_warm_up) {
-            record(self, passes);
+            record(self, passes)?;
             passes.submit(&self.gpu);
             self.gpu.wait()?;
             n_warm += 1;
         }
         let since = Instant::now();
         for _ in 0..repeats.n_consecutive {
-            record(self, passes);
+            record(self, passes)?;
             passes.submit(&self.gpu);
         }
         self.gpu.wait()?;
         let consecutive_millis = since.elapsed().as_secs_f64() * 1e3 / repeats.n_consecutive as f64;
         let mut spans = Vec::new();
         for _ in 0..repeats.n_timed {
-            record(self, passes);
+            record(self, passes)?;
             let since = Instant::now();
             let span = passes.submit_timed_total(&self.gpu)?;
             spans.push(span.unwrap_or_else(|| since.elapsed().as_secs_f64() * 1e3));
@@ -289,7 +325,7 @@ impl KernelBench {
     }
 
     fn mean_rgb(&self, passes: &mut Passes) -> Result<[f64; 3], Error> {
-        self.record_picture(passes);
+        self.record_picture(passes)?;
         passes.submit(&self.gpu);
         let n = (self.size_px[0] * self.size_px[1]) as usize;
         let image: Vec<[f32; 4]> = self.gpu.read(&self.image_buffers.image, n)?;
