@@ -119,7 +119,7 @@ pub struct LiveRun {
 pub struct InputCounts {
     /// Color images.
     pub images: u64,
-    /// Color and depth images that were dropped because they came too fast.
+    /// Color and depth images that were dropped, by devices or because they came too fast.
     pub dropped_images: u64,
     /// Range scans in the world frame.
     pub range_scans: u64,
