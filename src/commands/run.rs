@@ -125,8 +125,9 @@ const RECORD: &str = "record";
 const FINAL_STATUS_TIME: Duration = Duration::from_millis(400);
 /// Steps between two keyframes if the flag is not given.
 const DEFAULT_STEPS_PER_KEYFRAME: u64 = 10;
-/// Evaluation interrupts a live run, so it must be short.
+/// Keyframes wait during an evaluation, so it must be short, especially where the CPU draws the images.
 const MAX_IMAGES_SCORED_LIVE: usize = 12;
+const MAX_IMAGES_SCORED_LIVE_ON_CPU: usize = 4;
 
 /// The entries of the report besides scores.
 #[derive(Debug, Serialize)]
@@ -316,7 +317,10 @@ pub(super) fn start(
     let notes = notes(&gpu);
     let evaluators = Evaluators {
         during_training: Evaluator::psnr_only(),
-        max_images_during_training: MAX_IMAGES_SCORED_LIVE,
+        max_images_during_training: match gpu.is_software() {
+            true => MAX_IMAGES_SCORED_LIVE_ON_CPU,
+            false => MAX_IMAGES_SCORED_LIVE,
+        },
         at_end: Evaluator::thorough(None)?,
     };
     let limits = Limits { seconds: args.seconds, steps: args.steps };
