@@ -22,7 +22,7 @@ const STATE_PAIRS: u32 = 128;
 const HIDDEN_ENTRIES: u32 = 1024;
 
 /// Tiles per bin.
-const BIN_TILES: u32 = 16;
+const TILES_PER_BIN: u32 = 16;
 
 /// Number of buffers with one entry per splat.
 pub(crate) const N_PLANAR_BUFFERS: usize = 9;
@@ -277,7 +277,7 @@ impl Scratch {
         let ScratchSize { n_splats, n_entries, n_slots, n_bins } = size;
         let n_blocks = n_splats.div_ceil(BLOCK);
         let n_segments = if n_slots > 0 && pipelines.has_segments { n_segments(n_entries, n_slots) } else { [0; 2] };
-        let n_of_tiles = 3 * BIN_TILES * n_bins; // The first segment and two pieces of each tile.
+        let n_of_tiles = 3 * TILES_PER_BIN * n_bins; // The first segment and two pieces of each tile.
         let segment_bytes = 16 * (u64::from(n_segments[0]) + u64::from(n_segments[1]) + u64::from(n_of_tiles));
         let state_bytes = u64::from(4 * N_STATE_PARTS * 2 * STATE_PAIRS);
         let per_bin = |name: &str, n: u32| gpu.storage(name, 4 * u64::from(n_bins) * u64::from(n.max(1)));
@@ -311,7 +311,7 @@ impl Scratch {
 /// Maximum number of segments after the first of each tile, and of pieces of hidden ends (without two per tile), for
 /// lists of this length; see shared/segment.wgsl.
 fn n_segments(n_entries: u32, n_slots: u32) -> [u32; 2] {
-    [(n_slots / SEGMENT_SPLATS).min(2 * TARGET_SEGMENTS), n_entries.div_ceil(HIDDEN_ENTRIES / BIN_TILES)]
+    [(n_slots / SEGMENT_SPLATS).min(2 * TARGET_SEGMENTS), n_entries.div_ceil(HIDDEN_ENTRIES / TILES_PER_BIN)]
 }
 
 /// Buffers of one picture, and of its gradients in training.
@@ -386,6 +386,6 @@ mod tests {
         for (name, value) in in_rust {
             assert_eq!(constant_in_wgsl(KERNELS, name), value, "{name}");
         }
-        assert_eq!(constant_in_wgsl(KERNELS, "BIN_TILES").pow(2), BIN_TILES, "along both axes of the image");
+        assert_eq!(constant_in_wgsl(KERNELS, "BIN_TILES").pow(2), TILES_PER_BIN, "along both axes of the image");
     }
 }
