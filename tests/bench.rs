@@ -73,7 +73,7 @@ fn kernel_bench_reports_every_variant() {
         assert!(row[column].as_f64() > Some(0.0), "{column}: {row}");
     }
     assert!(
-        row["n_visible"].as_u64().is_some_and(|n| (50..1500).contains(&n)),
+        row["n_splats_in_view"].as_u64().is_some_and(|n| (50..1500).contains(&n)),
         "only some of the splats are visible: {row}"
     );
     let plain = Command::new(env!("CARGO_BIN_EXE_fieldrig"))
@@ -83,6 +83,23 @@ fn kernel_bench_reports_every_variant() {
         .expect("fieldrig starts");
     let row: Value = serde_json::from_slice(&plain.stdout).expect("a JSON object");
     assert!(row["step_visible_millis"].as_f64() > Some(0.0), "{row}");
+}
+
+/// The counts that `--scan` is made for, with as many splats per pixel as in a scan: see docs/benchmarks/README.md.
+#[test]
+fn kernel_bench_of_a_scan_has_uneven_lists() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let row = &events(
+        folder.path(),
+        &["kernels", "--scan", "--size", "160x120", "--splats", "25000", "--repeats", "1", "--json"],
+    )[0];
+    let count = |name: &str| row[name].as_f64().unwrap_or_else(|| panic!("no {name} in {row}"));
+    let mean = count("n_intersections") / count("n_tiles");
+    assert!((400.0..900.0).contains(&mean), "{row}");
+    let visible_frac = count("n_visible") / count("n_intersections");
+    assert!((0.9..=1.0).contains(&visible_frac), "{visible_frac}: {row}");
+    assert!(count("longest_list") > 2.0 * mean, "{row}");
+    assert_eq!(count("largest_splat"), count("n_tiles"));
 }
 
 #[test]

@@ -116,6 +116,36 @@ fn memory_bench_measures_a_run_with_a_viewer() {
     assert_eq!(left, 4, "the folder of the run is removed");
 }
 
+/// A recording of two seconds, played for longer.
+#[test]
+fn live_bench_repeats_a_recording() {
+    const N_IMAGES: i64 = 30;
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    rig_file_for(folder, N_IMAGES);
+    events(folder, &["record", "rig.toml", "--sim", "--out", "scan.mcap", "--json"]);
+    let played = ["--repeat", "--seconds", "8", "--json"];
+    let bench = ["bench", "live", "scan.mcap", "--viewers", "1", "--size", "64x48", "--out", "live"];
+    let printed = events(folder, &[&bench[..], &played[..], &["--", "--max-splats", "2000"]].concat());
+    let run = printed.iter().find(|event| event["event"] == "run").map(|event| &event["run"]).expect("a run");
+    let buckets = run["over_time"]["buckets"].as_array().expect("intervals of a second");
+    assert!((3..=8).contains(&buckets.len()), "{run}");
+    assert!(buckets.iter().all(|bucket| number(bucket, "host_mb") > 10.0), "{run}");
+    let last = buckets.last().expect("an interval");
+    assert!(number(last, "steps_per_sec") > 0.0 && number(last, "seconds") > 4.0, "{run}");
+
+    let replay = ["run", "rig.toml", "--from", "scan.mcap", "--real-time", "--listen", "127.0.0.1:0", "--out", "again"];
+    events(folder, &[&replay[..], &played[..]].concat());
+    let report = std::fs::read_to_string(folder.join("again/report.json")).expect("a report");
+    let report: Value = serde_json::from_str(&report).expect("JSON");
+    let rejected = report["rejected"].as_object().expect("counts");
+    let n_rejected: u64 = rejected.values().filter_map(Value::as_u64).sum();
+    let n_images = n_rejected + report["keyframes"].as_u64().expect("a count");
+    assert!(n_images > 30, "{n_images} images in several rounds: {report}");
+    let error_m = number(&report, "max_position_error_m");
+    assert!(error_m < MAX_POSITION_ERROR_M, "a camera pose is off by {error_m} m");
+}
+
 /// Number of keyframes to fuse.
 const N_FUSED: &str = "10";
 /// Measured 18 dB: regions not observed yet have no surface.

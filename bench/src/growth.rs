@@ -2,6 +2,7 @@
 
 use crate::Result;
 use crate::statistics::theil_sen;
+use crate::viewer::ReceivedPicture;
 use keyframe::failed;
 use kinematics::quantile::median;
 use serde::Serialize;
@@ -56,13 +57,15 @@ pub enum Excluded {
 }
 
 impl Excluded {
-    fn bytes(self, sample: &Sample) -> f64 {
+    /// The remaining resident memory, also without the times of pictures, which the viewers of a benchmark store.
+    pub(crate) fn bytes(self, sample: &Sample) -> f64 {
         let excluded_bytes = match self {
             Self::Nothing => 0,
             Self::Model => sample.model_bytes,
             Self::Training => sample.gpu_bytes.saturating_sub(sample.gpu_image_bytes),
         };
-        sample.resident_bytes as f64 - excluded_bytes as f64
+        let times_bytes = sample.pictures * size_of::<ReceivedPicture>() as u64;
+        sample.resident_bytes as f64 - (excluded_bytes + times_bytes) as f64
     }
 }
 

@@ -8,8 +8,8 @@ use std::path::PathBuf;
 use std::time::Duration;
 use trainer::gpu::PassTiming;
 use trainer::splat::arrays::SplatArrays;
-use trainer::splat::bench::{Eye, KernelFigures, Repeats, time_kernels};
-use trainer::splat::cloud::{load_cloud_npz, synthetic_cloud};
+use trainer::splat::bench::{Eye, KernelFigures, KernelSetup, Losses, Repeats, time_kernels};
+use trainer::splat::cloud::{load_cloud_npz, scan_cloud, synthetic_cloud};
 
 /// Values of options that are not given.
 struct Defaults {
@@ -26,6 +26,10 @@ const DEFAULTS: Defaults = Defaults {
 };
 /// Defaults on the CPU, which is about a thousand times slower than a GPU and supports only smaller buffers.
 const DEFAULTS_ON_CPU: Defaults = Defaults { sizes_px: &[[320, 240]], n_splats: &[10_000, 30_000], n_repeats: 3 };
+/// Defaults of [`KernelsOptions::scan`].
+const SCAN_DEFAULTS: Defaults = Defaults { sizes_px: &[[640, 480]], n_splats: &[400_000], n_repeats: 30 };
+/// The same number of splats per pixel.
+const SCAN_DEFAULTS_ON_CPU: Defaults = Defaults { sizes_px: &[[160, 120]], n_splats: &[25_000], n_repeats: 3 };
 
 /// Options of [`measure`].
 #[derive(Clone, Debug)]
@@ -40,6 +44,9 @@ pub struct KernelsOptions {
     pub n_repeats: Option<u32>,
     /// Whether the camera is inside the cloud, so that only some of the splats are visible.
     pub inside: bool,
+    /// Whether to measure a step like those of a scan with depth: its splats are distributed unevenly, and the loss
+    /// includes D-SSIM and depth. Without `cloud` and `inside`.
+    pub scan: bool,
     /// Whether to report the GPU time of each pass.
     pub profile: bool,
 }
@@ -76,7 +83,12 @@ pub fn measure<E: From<Error>>(
         .as_deref()
         .map(|path| load_cloud_npz(path).with_context(|| format!("cloud {path:?}")))
         .transpose()?;
-    let defaults = if open_gpu()?.is_software() { DEFAULTS_ON_CPU } else { DEFAULTS };
+    let defaults = match (options.scan, open_gpu()?.is_software()) {
+        (false, false) => DEFAULTS,
+        (false, true) => DEFAULTS_ON_CPU,
+        (true, false) => SCAN_DEFAULTS,
+        (true, true) => SCAN_DEFAULTS_ON_CPU,
+    };
     let sizes_px = if options.sizes_px.is_empty() { defaults.sizes_px } else { &options.sizes_px };
     let splat_counts = if options.n_splats.is_empty() { defaults.n_splats } else { &options.n_splats };
     let counts = given.as_ref().map_or_else(
@@ -85,6 +97,10 @@ pub fn measure<E: From<Error>>(
     );
     let n_repeats = options.n_repeats.unwrap_or(defaults.n_repeats) as usize;
     let eye = if options.inside { Eye::Inside } else { Eye::Outside };
+    let (losses, generate): (_, fn(usize, u64) -> SplatArrays) = match options.scan {
+        true => (Losses::Training, scan_cloud),
+        false => (Losses::L1, synthetic_cloud),
+    };
     for (size_ix, size_px) in sizes_px.iter().enumerate() {
         for n_splats in &counts {
             // Each row uses a new device, so that the peak memory of earlier rows is not included.
@@ -96,7 +112,7 @@ pub fn measure<E: From<Error>>(
             let cloud: &SplatArrays = match &given {
                 Some(cloud) => cloud,
                 None => {
-                    synthetic = synthetic_cloud(*n_splats, 0);
+                    synthetic = generate(*n_splats, 0);
                     &synthetic
                 }
             };
@@ -106,7 +122,8 @@ pub fn measure<E: From<Error>>(
                 n_timed: n_repeats,
                 n_consecutive: 3 * n_repeats,
             };
-            let figures = time_kernels(&gpu, cloud, *size_px, eye, repeats).with_context(|| {
+            let setup = KernelSetup { size_px: *size_px, eye, losses };
+            let figures = time_kernels(&gpu, cloud, setup, repeats).with_context(|| {
                 let [width, height] = size_px;
                 format!("{width}x{height} pixels and {n_splats} splats: try fewer --splats or a smaller --size")
             })?;

@@ -38,6 +38,7 @@ mod growth;
 pub mod kernels;
 pub mod live;
 pub mod memory;
+mod over_time;
 mod peer;
 mod runs;
 pub mod stability;
@@ -49,6 +50,7 @@ mod viewer;
 pub use disturb::Disturbance;
 pub use findings::{BenchResult, Findings};
 pub use growth::{Excluded, Growth, Sample, resident_bytes};
+pub use over_time::{Bucket, OverTime, Timeline, Trend};
 pub use runs::{BenchObserver, Disturbed, Host, Run, RunReport, RunScores, RunSettings, RunsOptions};
 // Errors of benches come from sessions and files, so benches use the error type of `session`.
 pub use session::{Error, Result};

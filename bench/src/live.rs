@@ -4,9 +4,10 @@
 //! All times are on the clock of this process, from mid-exposure of an image to the arrival of a picture at its viewer.
 
 use crate::findings::Findings;
+use crate::over_time::{OverTime, Timeline};
 use crate::viewer::{ReceivedPicture, Viewer};
-use capture::Rig;
 use capture::config::Parent;
+use capture::{InputResult, Rig};
 use keyframe::counted;
 use kinematics::Transform;
 use kinematics::quantile::{Rank, quantile};
@@ -15,6 +16,7 @@ use nalgebra::{UnitQuaternion, UnitVector3, Vector3};
 use serde::Serialize;
 use session::chart::{Axis, Chart, Line, Point, Scale};
 use session::{KeyframeTimes, Live, Table};
+use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
 use std::time::{Duration, Instant};
 
@@ -101,15 +103,48 @@ pub struct LiveRun {
     /// Number of keyframes at the end.
     pub keyframes: usize,
     /// Durations by name, in the order in which they occur.
-    pub latencies: Vec<(&'static str, Latency)>,
+    pub latencies: Vec<(String, Latency)>,
     /// Training seconds and PSNR in dB at the scheduled evaluations.
     pub psnr: Vec<(f64, f64)>,
+    /// PSNR of each camera at the last scheduled evaluation, dB; empty with one camera.
+    pub psnr_per_camera: BTreeMap<String, f64>,
+    /// The run over time.
+    pub over_time: OverTime,
+    /// Counts of the input.
+    pub input: InputCounts,
+}
+
+/// Counts of the input of a run.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
+pub struct InputCounts {
+    /// Color images.
+    pub images: u64,
+    /// Color and depth images that were dropped, by devices or because they came too fast.
+    pub dropped_images: u64,
+    /// Range scans in the world frame.
+    pub range_scans: u64,
+    /// Stations of the base after the first that were registered.
+    pub stations: usize,
+}
+
+impl InputCounts {
+    /// Counts of an input that has ended.
+    #[must_use]
+    pub fn of(input_result: &InputResult) -> Self {
+        let counts = input_result.join.counts();
+        Self {
+            images: counts.images,
+            dropped_images: counts.device_skipped,
+            range_scans: counts.range_scans,
+            stations: input_result.stations.as_ref().map_or(0, |stations| stations.reports().len()),
+        }
+    }
 }
 
 impl LiveRun {
-    /// Collects the measurements of a run that is over.
+    /// Collects the measurements of a run that is over, except for the counts of its input.
     #[must_use]
-    pub fn of(conditions: Conditions, live: &Live, viewers: &[Viewer]) -> Self {
+    pub fn of(conditions: Conditions, live: &Live, viewers: &[Viewer], timeline: &Timeline) -> Self {
         let session = &live.sessions()[0];
         let (progress, seconds) = (session.progress(), session.secs());
         let pictures: Vec<Vec<ReceivedPicture>> = viewers.iter().map(Viewer::pictures).collect();
@@ -126,6 +161,12 @@ impl LiveRun {
                 .iter()
                 .filter_map(|evaluation| Some((evaluation.seconds, evaluation.scores.psnr?)))
                 .collect(),
+            psnr_per_camera: session
+                .evaluations()
+                .last()
+                .map_or(BTreeMap::new(), |evaluation| evaluation.scores.psnr_per_camera.clone()),
+            over_time: timeline.over_time(&pictures),
+            input: InputCounts::default(),
         }
     }
 
@@ -136,14 +177,20 @@ impl LiveRun {
     }
 }
 
-/// Latencies of all pictures, and of all keyframes until the first viewer receives them in a picture.
-fn latencies(pictures: &[Vec<ReceivedPicture>], keyframes: &[KeyframeTimes]) -> Vec<(&'static str, Latency)> {
+/// Latencies of all pictures, and of all keyframes until the first viewer receives them in a picture. With several
+/// cameras, also the latencies of each camera up to the model.
+fn latencies(pictures: &[Vec<ReceivedPicture>], keyframes: &[KeyframeTimes]) -> Vec<(String, Latency)> {
     let of_pictures =
         |name, millis: fn(&ReceivedPicture) -> f64| (name, Latency::of(pictures.iter().flatten().map(millis)));
     let since_shutter = |at: &dyn Fn(&KeyframeTimes) -> Option<Instant>| {
         let millis_of =
             |keyframe: &KeyframeTimes| Some(millis(at(keyframe)?.checked_duration_since(keyframe.input.captured?)?));
         Latency::of(keyframes.iter().filter_map(millis_of))
+    };
+    let cameras: BTreeSet<&str> = keyframes.iter().map(|keyframe| &*keyframe.camera).collect();
+    let of_camera = |camera: &&str| {
+        let pushed = since_shutter(&|keyframe| (*keyframe.camera == **camera).then_some(keyframe.pushed));
+        (format!("shutter to model, camera {camera}"), pushed)
     };
     let to_picture = pictures.first().and_then(|pictures| Latency::of(shutter_to_picture(pictures, keyframes)));
     let named = [
@@ -162,7 +209,9 @@ fn latencies(pictures: &[Vec<ReceivedPicture>], keyframes: &[KeyframeTimes]) -> 
         ("shutter to first step", since_shutter(&|keyframe| keyframe.trained)),
         ("shutter to picture", to_picture),
     ];
-    named.into_iter().filter_map(|(name, latency)| Some((name, latency?))).collect()
+    let of_cameras = cameras.iter().map(of_camera).filter(|_| cameras.len() > 1);
+    let named = named.into_iter().map(|(name, latency)| (name.to_owned(), latency)).chain(of_cameras);
+    named.filter_map(|(name, latency)| Some((name, latency?))).collect()
 }
 
 /// For each keyframe, the time from mid-exposure to the arrival of the first picture that contains it, milliseconds.
@@ -193,7 +242,7 @@ pub fn findings(input: &str, runs: &[LiveRun]) -> Findings {
     };
     let mut names: Vec<&str> = Vec::new();
     for (name, _) in runs.iter().flat_map(|run| &run.latencies) {
-        if !names.contains(name) {
+        if !names.contains(&&**name) {
             names.push(name);
         }
     }
@@ -205,17 +254,72 @@ pub fn findings(input: &str, runs: &[LiveRun]) -> Findings {
     add("training steps per second", &|run| format!("{:.1}", run.steps_per_sec));
     add("primitives", &|run| run.primitives.to_string());
     add("keyframes", &|run| run.keyframes.to_string());
+    let is_any = |count: fn(&InputCounts) -> bool| runs.iter().any(|run| count(&run.input));
+    if is_any(|input| input.dropped_images > 0) {
+        add("images dropped", &|run| run.input.dropped_images.to_string());
+    }
+    if is_any(|input| input.range_scans > 0) {
+        add("range scans", &|run| run.input.range_scans.to_string());
+    }
+    if is_any(|input| input.stations > 0) {
+        add("stations registered", &|run| run.input.stations.to_string());
+    }
     let marks = runs.iter().map(|run| &run.psnr).max_by_key(|psnr| psnr.len());
     for (ix, (seconds, _)) in marks.into_iter().flatten().enumerate() {
         add(&format!("test PSNR at {seconds:.1} s, dB"), &|run| {
             run.psnr.get(ix).map_or(String::new(), |(_, psnr)| format!("{psnr:.2}"))
         });
     }
+    let cameras: BTreeSet<&String> = runs.iter().flat_map(|run| run.psnr_per_camera.keys()).collect();
+    for camera in cameras {
+        add(&format!("last test PSNR, camera {camera}, dB"), &|run| {
+            run.psnr_per_camera.get(camera).map_or(String::new(), |psnr| format!("{psnr:.2}"))
+        });
+    }
+    let head: Vec<String> =
+        ["quantity".to_owned()].into_iter().chain(runs.iter().map(|run| run.conditions.to_string())).collect();
+    let mut tables = vec![Table { title: "Live run".to_owned(), head: head.clone(), rows }];
+    let rows = OverTime::rows(&runs.iter().map(|run| &run.over_time).collect::<Vec<_>>());
+    if !rows.is_empty() {
+        tables.push(Table { title: "Second half: medians and changes".to_owned(), head, rows });
+    }
     let line = |run: &LiveRun| Line {
         label: run.conditions.to_string(),
         points: run.psnr.iter().map(|&(x, y)| Point { x, y, low: y, high: y }).collect(),
         is_peer: false,
     };
+    let mut charts = vec![(
+        "",
+        Chart {
+            title: "Accuracy of a live run".to_owned(),
+            subtitle: input.to_owned(),
+            x: Axis { label: "seconds of training".to_owned(), scale: Scale::Log, ticks: Vec::new() },
+            y: Axis { label: "test PSNR, dB".to_owned(), scale: Scale::Linear, ticks: Vec::new() },
+            lines: runs.iter().map(line).filter(|line| !line.points.is_empty()).collect(),
+            thresholds: Vec::new(),
+            markers: Vec::new(),
+        },
+    )];
+    // The first run with viewers; without viewers, there is no latency.
+    let charted = runs.iter().rev().max_by_key(|run| run.over_time.trends.len());
+    if let Some(run) = charted.filter(|run| !run.over_time.trends.is_empty()) {
+        charts.push((
+            "-over-time",
+            Chart {
+                title: "Live run over time".to_owned(),
+                subtitle: format!("{}: {input}", run.conditions),
+                x: Axis { label: "minutes of training".to_owned(), scale: Scale::Linear, ticks: Vec::new() },
+                y: Axis {
+                    label: "% of the median in the second half".to_owned(),
+                    scale: Scale::Linear,
+                    ticks: Vec::new(),
+                },
+                lines: run.over_time.lines(),
+                thresholds: Vec::new(),
+                markers: Vec::new(),
+            },
+        ));
+    }
     Findings {
         name: "live",
         title: "Live run".to_owned(),
@@ -224,23 +328,8 @@ pub fn findings(input: &str, runs: &[LiveRun]) -> Findings {
             "A picture contains a keyframe if the model took a step after the keyframe was added. Shutter times are mid-exposure."
                 .to_owned(),
         ],
-        charts: vec![(
-            "",
-            Chart {
-                title: "Accuracy of a live run".to_owned(),
-                subtitle: input.to_owned(),
-                x: Axis { label: "seconds of training".to_owned(), scale: Scale::Log, ticks: Vec::new() },
-                y: Axis { label: "test PSNR, dB".to_owned(), scale: Scale::Linear, ticks: Vec::new() },
-                lines: runs.iter().map(line).filter(|line| !line.points.is_empty()).collect(),
-                thresholds: Vec::new(),
-                markers: Vec::new(),
-            },
-        )],
-        tables: vec![Table {
-            title: "Live run".to_owned(),
-            head: ["quantity".to_owned()].into_iter().chain(runs.iter().map(|run| run.conditions.to_string())).collect(),
-            rows,
-        }],
+        charts,
+        tables,
         numbers: serde_json::json!({ "input": input, "runs": runs }),
     }
 }

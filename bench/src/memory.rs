@@ -44,22 +44,8 @@ impl MemoryRun {
     ///
     /// If the system does not report the memory of this process.
     pub fn add_sample(&mut self, live: &Live, gpu: &Gpu, viewers: &[Viewer]) -> Result<Sample> {
-        self.gpu_buffers = gpu.live_bytes_by_label();
-        let sessions = live.sessions();
-        let sample = Sample {
-            seconds: sessions.first().map_or(0.0, |session| session.secs()),
-            resident_bytes: resident_bytes()?.0,
-            gpu_bytes: gpu.live_bytes(),
-            gpu_reserved_bytes: gpu.reserved_bytes(),
-            model_bytes: sessions.iter().map(|session| session.progress().bytes).sum(),
-            gpu_image_bytes: IMAGE_BUFFERS.iter().filter_map(|label| self.gpu_buffers.get(*label)).sum(),
-            keyframe_bytes: live.keyframes().iter().map(|keyframe| keyframe.bytes()).sum(),
-            keyframes: live.keyframes().len(),
-            evicted: live.n_evicted(),
-            step: sessions.first().map_or(0, |session| session.progress().step),
-            viewers: viewers.iter().filter(|viewer| viewer.is_connected()).count(),
-            pictures: viewers.iter().map(Viewer::n_pictures).sum(),
-        };
+        let (sample, gpu_buffers) = sample(live, gpu, viewers)?;
+        self.gpu_buffers = gpu_buffers;
         self.samples.push(sample);
         Ok(sample)
     }
@@ -160,6 +146,27 @@ impl MemoryRun {
             }),
         })
     }
+}
+
+/// Memory of a run in progress, and its GPU buffers, bytes by label.
+pub(crate) fn sample(live: &Live, gpu: &Gpu, viewers: &[Viewer]) -> Result<(Sample, BTreeMap<Arc<str>, u64>)> {
+    let gpu_buffers = gpu.live_bytes_by_label();
+    let sessions = live.sessions();
+    let sample = Sample {
+        seconds: sessions.first().map_or(0.0, |session| session.secs()),
+        resident_bytes: resident_bytes()?.0,
+        gpu_bytes: gpu.live_bytes(),
+        gpu_reserved_bytes: gpu.reserved_bytes(),
+        model_bytes: sessions.iter().map(|session| session.progress().bytes).sum(),
+        gpu_image_bytes: IMAGE_BUFFERS.iter().filter_map(|label| gpu_buffers.get(*label)).sum(),
+        keyframe_bytes: live.keyframes().iter().map(|keyframe| keyframe.bytes()).sum(),
+        keyframes: live.keyframes().len(),
+        evicted: live.n_evicted(),
+        step: sessions.first().map_or(0, |session| session.progress().step),
+        viewers: viewers.iter().filter(|viewer| viewer.is_connected()).count(),
+        pictures: viewers.iter().map(Viewer::n_pictures).sum(),
+    };
+    Ok((sample, gpu_buffers))
 }
 
 /// One component of memory use.

@@ -207,6 +207,7 @@ impl Pump {
     fn run(mut self) -> InputResult {
         let mut recording_error = None;
         let mut input_error = None;
+        let mut n_restarts = 0;
         while !self.stop.requested() {
             let sample = match self.input.source.next_sample() {
                 Ok(Some(sample)) => sample,
@@ -217,6 +218,11 @@ impl Pump {
                     break;
                 }
             };
+            let is_restarted = self.input.source.n_restarts() > n_restarts;
+            n_restarts = self.input.source.n_restarts();
+            if is_restarted && self.restart().is_err() {
+                break;
+            }
             if let (Some(recorder), None) = (&mut self.input.recorder, &recording_error)
                 && let Err(error) = recorder.write(&sample)
             {
@@ -247,6 +253,14 @@ impl Pump {
             recording_error = Some(error.into());
         }
         InputResult { join: self.input.join, stations: self.input.stations, input_error, recording_error }
+    }
+
+    /// Ends a round of a repeated source.
+    fn restart(&mut self) -> Result<(), TrainerGone> {
+        let events = self.input.join.restart();
+        self.forward(events)?;
+        let released = self.input.stations.as_mut().map(Stations::restart);
+        self.send(released.unwrap_or_default())
     }
 
     fn forward(&mut self, events: Vec<JoinEvent>) -> Result<(), TrainerGone> {

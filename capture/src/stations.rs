@@ -151,6 +151,15 @@ impl Stations {
         released
     }
 
+    /// Starts again at the first station without a correction, because the source starts again. Returns the queued
+    /// changes in order.
+    pub(crate) fn restart(&mut self) -> Vec<Change> {
+        let released = self.finish();
+        self.station = None;
+        (self.world_from_base, self.map_from_odom) = (Transform::identity(), Transform::identity());
+        released
+    }
+
     /// Corrects all keyframes of a recording and returns them in the same order.
     #[must_use]
     pub fn corrected(&mut self, keyframes: Vec<Arc<Keyframe>>) -> Vec<Arc<Keyframe>> {
@@ -583,6 +592,17 @@ mod tests {
         let camera = Transform::translation(0.1, 0.2, 0.3);
         assert_ne!(stations.corrected_pose("wrist", &camera), camera);
         assert_eq!(stations.corrected_pose("of the room", &camera), camera);
+    }
+
+    #[test]
+    fn restarted_source_begins_without_a_correction() {
+        let mut stations = stations();
+        let first_round = stations.corrected(all());
+        assert!(base_error(&all()[53]).0 > 15.0 && base_error(&first_round[53]).0 < 0.5);
+        assert!(stations.restart().is_empty(), "nothing is queued");
+        let second_round = stations.corrected(all());
+        assert_eq!(bits(&second_round[..24]), bits(&all()[..24]), "the first station is uncorrected");
+        assert!(base_error(&second_round[53]).0 < 0.5, "{:?}", base_error(&second_round[53]));
     }
 
     #[test]

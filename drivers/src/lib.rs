@@ -36,6 +36,7 @@ pub mod realsense;
 #[cfg(any(target_os = "linux", feature = "nokhwa", feature = "realsense"))]
 mod reconnecting;
 pub mod recording;
+mod repeating;
 mod sample;
 pub mod tags;
 #[cfg(test)]
@@ -52,6 +53,7 @@ pub use motion::MovableArm;
 pub use playback::{Playback, PlaybackClock};
 #[cfg(any(target_os = "linux", feature = "nokhwa", feature = "realsense"))]
 pub use reconnecting::CameraCounts;
+pub use repeating::Repeating;
 pub use sample::{BasePose, Image, PixelFormat, RangePoint, RangeScan, Sample, TruthImage};
 pub use yuv::{V4l2Colors, YuvColors, YuvLayout, YuvMatrix, YuvRange};
 
@@ -110,6 +112,12 @@ pub trait Source: Send {
 
     /// Number of joint states, base poses and range scans dropped so far because the caller was too slow.
     fn n_other_samples_dropped(&self) -> u64 {
+        0
+    }
+
+    /// Number of times, up to the latest sample, that the source has started again from its beginning. The robot is then
+    /// suddenly at another place, so nothing may be interpolated between the samples before and after.
+    fn n_restarts(&self) -> u64 {
         0
     }
 }

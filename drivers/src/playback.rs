@@ -90,6 +90,10 @@ impl Source for Playback {
     fn n_other_samples_dropped(&self) -> u64 {
         self.source.n_other_samples_dropped()
     }
+
+    fn n_restarts(&self) -> u64 {
+        self.source.n_restarts()
+    }
 }
 
 #[cfg(test)]

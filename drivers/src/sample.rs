@@ -124,4 +124,16 @@ impl Sample {
             Self::Truth(truth) => truth.image.stamp,
         }
     }
+
+    /// Adds a time to the stamp, nanoseconds.
+    pub(crate) fn shift(&mut self, nanos: i64) {
+        let stamp = match self {
+            Self::Image(image) => &mut image.stamp,
+            Self::Joints(state) => &mut state.stamp,
+            Self::Base(pose) | Self::BaseTruth(pose) => &mut pose.stamp,
+            Self::Range(scan) => &mut scan.stamp,
+            Self::Truth(truth) => &mut truth.image.stamp,
+        };
+        stamp.0 = stamp.0.saturating_add(nanos);
+    }
 }

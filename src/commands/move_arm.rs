@@ -38,7 +38,7 @@ pub(crate) struct Args {
     /// Confirm the motion: nobody is within reach of the arm, and a hand is on the emergency stop
     #[arg(long, required = true)]
     enable_motion: bool,
-    /// Exit as soon as the arm has arrived, even if its motors then release it
+    /// Exit as soon as the arm has arrived, even if its motors then release it or only damp its motion
     #[arg(long)]
     exit_on_arrival: bool,
     /// Print JSON, one object per line

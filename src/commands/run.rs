@@ -11,7 +11,9 @@ use anyhow::Context;
 use capture::config::{ArmDriver, Override, Rig};
 use capture::doctor;
 use capture::open::{self, Devices, Opened};
-use capture::{Counts, Feed, Input, Join, Rejection, SampleUse, StampClock, StationReport, Stations, Stop};
+use capture::{
+    Counts, Feed, Input, InputResult, Join, Rejection, SampleUse, StampClock, StationReport, Stations, Stop,
+};
 use drivers::Source;
 use keyframe::{Keyframe, Split, counted};
 use kinematics::Stamp;
@@ -55,6 +57,9 @@ pub(crate) struct Args {
     /// arrive, and images that come too fast are dropped
     #[arg(long, requires = "from", conflicts_with = "steps_per_keyframe")]
     real_time: bool,
+    /// Play the recording again whenever it ends, until --seconds or --steps are over
+    #[arg(long, requires = "real_time", conflicts_with = "record")]
+    repeat: bool,
     /// Also write everything that the devices send to an MCAP file. Images that devices drop then count as a loss (exit
     /// code 3)
     #[arg(long, value_name = "FILE")]
@@ -120,8 +125,9 @@ const RECORD: &str = "record";
 const FINAL_STATUS_TIME: Duration = Duration::from_millis(400);
 /// Steps between two keyframes if the flag is not given.
 const DEFAULT_STEPS_PER_KEYFRAME: u64 = 10;
-/// Evaluation interrupts a live run, so it must be short.
+/// Keyframes wait during an evaluation, so it must be short, especially where the CPU draws the images.
 const MAX_IMAGES_SCORED_LIVE: usize = 12;
+const MAX_IMAGES_SCORED_LIVE_ON_CPU: usize = 4;
 
 /// The entries of the report besides scores.
 #[derive(Debug, Serialize)]
@@ -247,13 +253,13 @@ impl Running {
         Ok(true)
     }
 
-    /// Closes the devices without saving anything; returns the error that ended them early, if any.
-    pub(super) fn discard(self) -> anyhow::Result<Option<drivers::Error>> {
+    /// Closes the devices without saving anything.
+    pub(super) fn discard(self) -> anyhow::Result<InputResult> {
         self.stop.request();
         let (mut sessions, input_result) = self.live.finish();
         // The caller may remove the folders, so checkpoints in progress must finish first.
         sessions.iter_mut().for_each(Session::wait_for_checkpoint);
-        Ok(input_result?.input_error)
+        Ok(input_result?)
     }
 }
 
@@ -313,7 +319,10 @@ pub(super) fn start(
     let notes = notes(&gpu);
     let evaluators = Evaluators {
         during_training: Evaluator::psnr_only(),
-        max_images_during_training: MAX_IMAGES_SCORED_LIVE,
+        max_images_during_training: match gpu.is_software() {
+            true => MAX_IMAGES_SCORED_LIVE_ON_CPU,
+            false => MAX_IMAGES_SCORED_LIVE,
+        },
         at_end: Evaluator::thorough(None)?,
     };
     let limits = Limits { seconds: args.seconds, steps: args.steps };
@@ -634,8 +643,11 @@ impl Args {
 
     fn open(&self, rig: Rig) -> anyhow::Result<Opened> {
         match &self.from {
-            Some(recording) if self.real_time => Ok(open::recording(recording, Some(rig), &[])?.in_real_time()),
-            Some(recording) => Ok(open::recording(recording, Some(rig), &[])?),
+            Some(recording) => {
+                let opened = open::recording(recording, Some(rig), &[])?;
+                let opened = if self.repeat { opened.repeated(recording) } else { opened };
+                Ok(if self.real_time { opened.in_real_time() } else { opened })
+            }
             None => Ok(open::rig(rig, if self.sim { Devices::Sim } else { Devices::Real })?),
         }
     }

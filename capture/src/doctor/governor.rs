@@ -1,4 +1,4 @@
-//! Checks the frequency governor of the processor.
+//! Checks the frequency governor of the CPU.
 
 use super::Finding;
 use std::path::Path;

@@ -131,7 +131,7 @@ pub fn listen(rig: &Rig, secs: f64, stop: &Stop) -> Result<ListenResult> {
         }
     }
     if let (Some(cpu_before), Some(cpu)) = (cpu_before, clock::process_cpu_time()) {
-        findings.push(Finding::ok("processor", cpu_message(cpu - cpu_before, began.elapsed())));
+        findings.push(Finding::ok("CPU", cpu_message(cpu - cpu_before, began.elapsed())));
     }
     // A simulation has its own clock.
     let is_simulated = open::is_any_simulated(&rig);
@@ -209,11 +209,7 @@ fn problem(statistics: &DeviceStatistics) -> Option<Finding> {
             )
         }
     };
-    Some(Finding::warn(
-        "rate",
-        message,
-        "usual causes: low light with automatic exposure, a slow bus, a busy processor",
-    ))
+    Some(Finding::warn("rate", message, "usual causes: low light with automatic exposure, a slow bus, a busy CPU"))
 }
 
 impl std::fmt::Display for DeviceStatistics {

@@ -214,6 +214,14 @@ impl Join {
         events
     }
 
+    /// Decides about the images that are still waiting, because the source starts again. Its stamps continue to
+    /// increase, but the robot jumps back, so the motion up to now is not used for later images.
+    pub(crate) fn restart(&mut self) -> Vec<JoinEvent> {
+        let events = self.finish();
+        self.motion.restart();
+        events
+    }
+
     /// Counts of all samples so far.
     #[must_use]
     pub fn counts(&self) -> &Counts {

@@ -130,6 +130,16 @@ impl Motion {
         }
     }
 
+    /// Forgets all readings.
+    pub(super) fn restart(&mut self) {
+        self.joints.clear();
+        if let BaseMotion::ReportedPoses(reported) = &mut self.base {
+            reported.poses.clear();
+            reported.truth.clear();
+            reported.station_detector.restart();
+        }
+    }
+
     /// Adds a ground truth base pose from a simulator.
     pub(super) fn push_base_truth(&mut self, truth: &BasePose) {
         if let BaseMotion::ReportedPoses(reported) = &mut self.base {

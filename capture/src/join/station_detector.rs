@@ -51,6 +51,11 @@ impl StationDetector {
         }
     }
 
+    /// Ends the current station, because the base is suddenly at another place.
+    pub(super) fn restart(&mut self) {
+        self.stationary_since = None;
+    }
+
     /// The station at a stamp that is not later than the newest pose; `None` while the base moves or has just stopped.
     pub(super) fn at(&self, stamp: Stamp) -> Option<usize> {
         let span = self.stations.iter().rev().find(|span| span.from <= stamp)?;
@@ -93,6 +98,21 @@ mod tests {
         assert_eq!(at(20.0), None, "no poses yet");
         // Answers given immediately equal answers given later.
         assert!(immediate.iter().all(|(stamp, station)| station_detector.at(*stamp) == *station));
+    }
+
+    #[test]
+    fn restart_begins_another_station() {
+        let mut station_detector = StationDetector::default();
+        let mut push = |from_tick: i32| {
+            (from_tick..from_tick + 100).for_each(|tick| {
+                station_detector.push(Stamp::from_secs(0.01 * f64::from(tick)), &Transform::identity());
+            });
+            station_detector.restart();
+        };
+        push(0);
+        push(100);
+        let at = |secs: f64| station_detector.at(Stamp::from_secs(secs));
+        assert_eq!([0.9, 1.2, 1.9].map(at), [Some(0), None, Some(1)]);
     }
 
     #[test]

@@ -288,6 +288,30 @@ fn images_without_joint_readings_are_dropped_and_counted() {
 }
 
 #[test]
+fn restarted_source_gives_no_pose_across_the_jump() {
+    let rig = rig(&[]);
+    let mut repeated = join(&rig);
+    let first = run_join(&mut repeated, samples(2));
+    assert_eq!(first.n_posed, 20);
+    repeated.restart();
+    // The second round continues 5 ms after the first, and an image between them arrives late.
+    let late = Sample::Image(color("wrist", 1_997_500_000));
+    let round = samples(2).into_iter().map(|mut sample| {
+        match &mut sample {
+            Sample::Image(Image { stamp, .. })
+            | Sample::Joints(JointState { stamp, .. })
+            | Sample::Truth(TruthImage { image: Image { stamp, .. }, .. }) => stamp.0 += 2_000_000_000,
+            other => panic!("{other:?}"),
+        }
+        sample
+    });
+    let second = run_join(&mut repeated, [late].into_iter().chain(round));
+    assert_eq!(second.n_posed, 20);
+    assert_eq!(second.rejected.iter().filter(|why| **why == Rejection::NoPose).count(), 1, "the late image");
+    assert_eq!(second.rejected.iter().filter(|why| **why == Rejection::NotMoved).count(), 20, "the same poses again");
+}
+
+#[test]
 fn non_finite_readings_reject_nearby_images() {
     let rig = rig(&[]);
     let broken = samples(4).into_iter().map(|sample| match sample {

@@ -16,7 +16,7 @@ use crate::config::{ArmDriver, BaseDriver, CameraDriver, Override, Parent, Rig, 
 use crate::error::{Context, Error};
 use crate::stamp_clock::StampClock;
 use drivers::recording::{RIG_FILE, Recorder, Recording, RecordingMetadata, URDF_FILE};
-use drivers::{Live, Playback, Sample, Source};
+use drivers::{Live, Playback, Repeating, Sample, Source};
 use keyframe::bail;
 use kinematics::Chain;
 use std::path::Path;
@@ -56,6 +56,17 @@ impl Opened {
     pub fn in_real_time(self) -> Self {
         let playback = Playback::new(self.source);
         Self { stamp_clock: StampClock::Playback(playback.clock()), source: Box::new(playback), ..self }
+    }
+
+    /// Starts the recording at `path` again whenever it ends.
+    #[must_use]
+    pub fn repeated(self, path: &Path) -> Self {
+        let (path, damage) = (path.to_owned(), Arc::clone(&self.damage));
+        let reopen = move || -> Result<Box<dyn Source>, drivers::Error> {
+            let recording = Recording::open(&path)?;
+            Ok(Box::new(RecordingSource { recording, damage: Arc::clone(&damage) }))
+        };
+        Self { source: Box::new(Repeating::new(self.source, reopen)), ..self }
     }
 }
 

@@ -6,8 +6,8 @@ use crate::commands::run;
 use crate::exit::Exit;
 use crate::print;
 use anyhow::Context;
-use bench::live::{Conditions, HandEyeError, LiveRun, findings};
-use bench::{BenchResult, Viewer, ViewerOptions};
+use bench::live::{Conditions, HandEyeError, InputCounts, LiveRun, findings};
+use bench::{BenchResult, Timeline, Viewer, ViewerOptions};
 use capture::{Rig, open};
 use session::run_folder::CreatedFolders;
 use std::ffi::OsString;
@@ -21,9 +21,13 @@ pub(crate) struct Args {
     /// Rig file [default: the one stored in the recording]
     #[arg(long, value_name = "FILE")]
     rig: Option<PathBuf>,
-    /// Length of each run in seconds, counted from the first image; training continues after the end of the recording
+    /// Length of each run in seconds, counted from the first image. After the end of the recording, training continues
     #[arg(long, value_name = "S", default_value_t = 60.0, value_parser = super::super::number_in_range(1.0..=1e6))]
     seconds: f64,
+    /// Play the recording again whenever it ends. From two minutes on, the changes of latency, accuracy, training speed
+    /// and memory per hour are reported
+    #[arg(long)]
+    repeat: bool,
     /// Numbers of viewers that request pictures back to back, one run each
     #[arg(long, value_name = "N,...", value_delimiter = ',', default_value = "0,1,8", value_parser = clap::value_parser!(u64).range(0..=32))]
     viewers: Vec<u64>,
@@ -80,7 +84,13 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Exit> {
     }
     let [width, height] = args.size;
     let kind = if args.panorama { "panoramas" } else { "pictures" };
-    let input = format!("{}, {kind} of {width}x{height}, {} s", args.recording.display(), args.seconds);
+    let mut input = format!("{}, {kind} of {width}x{height}, {} s", args.recording.display(), args.seconds);
+    if args.repeat {
+        input.push_str(", repeated");
+    }
+    for flag in &args.run_flags {
+        input.push_str(&format!(" {}", flag.display()));
+    }
     let findings = findings(&input, &runs);
     let page = findings.write(&args.out)?;
     print_result(&BenchResult { findings, page, data_losses: Vec::new() }, args.json)?;
@@ -122,7 +132,8 @@ impl Args {
             error.apply(&mut rig);
         }
         rig.write_resolved(folder).with_context(|| format!("cannot write into {}", folder.display()))?;
-        let flags = vec!["--from".into(), self.recording.clone().into(), "--real-time".into()];
+        let mut flags = vec!["--from".into(), self.recording.clone().into(), "--real-time".into()];
+        flags.extend(self.repeat.then(|| "--repeat".into()));
         let (rig_file, out) = (folder.join(drivers::recording::RIG_FILE), folder.join("out"));
         let flags = run_flags::parse(&rig_file, self.seconds, (&out, self.json), flags, &self.run_flags)?;
         let mut running = run::start(&flags, None, &mut CreatedFolders::default())?;
@@ -130,12 +141,17 @@ impl Args {
         let options = ViewerOptions { size_px: self.size, is_panorama: self.panorama };
         let viewers: Vec<Viewer> =
             (0..conditions.n_viewers).map(|_| Viewer::connect(address, options)).collect::<bench::Result<_>>()?;
-        while running.run_time_slice()? {}
-        let measured = LiveRun::of(conditions, &running.live, &viewers);
+        let mut timeline = Timeline::default();
+        while running.run_time_slice()? {
+            timeline.sample(&running.live, &running.gpu, &viewers);
+        }
+        let measured = LiveRun::of(conditions, &running.live, &viewers, &timeline);
         drop(viewers);
-        match running.discard()? {
+        let input_result = running.discard()?;
+        let input = InputCounts::of(&input_result);
+        match input_result.input_error {
             Some(error) => Err(anyhow::Error::new(error).context("the recording cannot be read")),
-            None => Ok(measured),
+            None => Ok(LiveRun { input, ..measured }),
         }
     }
 }

@@ -33,6 +33,22 @@ pub(crate) fn layout_in_wgsl(kernels: &[Kernel], name: &str) -> StructLayout {
     first.clone()
 }
 
+/// The value of the WGSL constant `name`, a u32. Asserts that all kernels that declare the constant agree.
+pub(crate) fn constant_in_wgsl(kernels: &[Kernel], name: &str) -> u32 {
+    let value = |kernel: &Kernel| {
+        let module = reflect(kernel.source.name, &resolve(kernel.source, kernel.shared).unwrap()).unwrap();
+        let (_, constant) = module.constants.iter().find(|(_, constant)| constant.name.as_deref() == Some(name))?;
+        match module.global_expressions[constant.init] {
+            wgpu::naga::Expression::Literal(wgpu::naga::Literal::U32(value)) => Some(value),
+            ref other => panic!("{name} is {other:?}"),
+        }
+    };
+    let values: Vec<u32> = kernels.iter().filter_map(value).collect();
+    let first = *values.first().unwrap_or_else(|| panic!("no kernel declares {name}"));
+    assert!(values.iter().all(|value| *value == first), "{name} differs between kernels: {values:?}");
+    first
+}
+
 /// Asserts that a struct has these fields, in this order and at the same offsets, in Rust and in the WGSL of `$kernels`.
 macro_rules! assert_layout {
     ($kernels:expr, $type:ident, [$($field:ident),* $(,)?]) => {

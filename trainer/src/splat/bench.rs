@@ -2,12 +2,16 @@
 //!
 //! The setup matches the benchmark of the peer implementation: a pinhole camera at [`Eye::Outside`] looking along z
 //! with a focal length of 0.9 image widths, a target of uniform noise, L1 loss, and an update of every splat per step.
+//! [`Losses::Training`] adds the other losses of training with depth.
 
 use super::arrays::SplatArrays;
 use super::buffers::{ImageBuffers, Scratch, ScratchSize, SplatBuffers, n_bins, n_tiles};
+use super::few_images::Scarcity;
 use super::kernels::{DrawPipelines, TrainPipelines};
+use super::options::SplatOptions;
 use super::params::{Camera, LOW_PASS_PX2, Rule, Supervision, status};
 use super::passes::{Target, ViewPasses};
+use super::work_counts::WorkCounts;
 use crate::gpu::{Buffer, Gpu, PassTiming, Passes, f32_of};
 use crate::packing::LazyPacker;
 use crate::{Error, Packing};
@@ -23,11 +27,17 @@ const JPEG_QUALITY: u8 = 92;
 /// Learning rate of every parameter. It is small, so that the cloud hardly changes.
 const RATE: f32 = 1e-5;
 
+/// Depth that the images of [`Losses::Training`] show, meters.
+const DEPTH_M: f32 = 3.2;
+/// Number of images, so many that few-image regularization is off.
+const N_IMAGES: usize = 1000;
+
 /// Results for one image size and cloud.
 #[derive(Clone, Debug, Serialize)]
 pub struct KernelFigures {
-    /// Intersections of splats with tiles.
-    pub n_intersections: u64,
+    /// Lists of the tiles.
+    #[serde(flatten)]
+    pub work: WorkCounts,
     /// Median GPU time of a picture, from the first pass to the last, milliseconds. Wall time if timestamps are
     /// unavailable.
     pub render_millis: f64,
@@ -38,8 +48,8 @@ pub struct KernelFigures {
     pub step_millis: f64,
     /// Median GPU time of a step that updates only visible splats, milliseconds.
     pub step_visible_millis: f64,
-    /// Number of visible splats.
-    pub n_visible: u64,
+    /// Number of splats in the view.
+    pub n_splats_in_view: u64,
     /// Mean wall time of consecutive pictures, milliseconds.
     pub render_wall_millis: f64,
     /// Mean wall time of consecutive steps, milliseconds.
@@ -69,6 +79,26 @@ impl Eye {
             Self::Inside => 0.0,
         }
     }
+}
+
+/// The loss of a step.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Losses {
+    /// L1.
+    L1,
+    /// L1, D-SSIM and depth, as in training with depth.
+    Training,
+}
+
+/// What is drawn and compared.
+#[derive(Clone, Copy, Debug)]
+pub struct KernelSetup {
+    /// Size of the image, pixels.
+    pub size_px: [u32; 2],
+    /// Position of the camera.
+    pub eye: Eye,
+    /// The loss.
+    pub losses: Losses,
 }
 
 /// Numbers of repetitions.
@@ -104,21 +134,20 @@ struct KernelBench {
     rule_visible: Buffer,
     packer: RefCell<LazyPacker>,
     size_px: [u32; 2],
+    losses: Losses,
 }
 
-/// Times the kernels on `cloud` at one image size.
+/// Times the kernels on `cloud`.
 pub fn time_kernels(
     gpu: &Arc<Gpu>,
     cloud: &SplatArrays,
-    size_px: [u32; 2],
-    eye: Eye,
+    setup: KernelSetup,
     repeats: Repeats,
 ) -> Result<KernelFigures, Error> {
-    let mut bench = KernelBench::new(gpu.clone(), cloud, size_px, eye)?;
+    let mut bench = KernelBench::new(gpu.clone(), cloud, setup)?;
     bench.size_buffers()?;
     let mut passes = Passes::default();
     let mean_rgb = bench.mean_rgb(&mut passes)?;
-    let n_intersections = u64::from(bench.counters()?[status::NEED_SLOTS]);
     let (render_millis, render_wall_millis) = bench.time(&mut passes, repeats, KernelBench::record_picture)?;
     let (step_millis, step_wall_millis) = bench.time(&mut passes, repeats, KernelBench::record_step)?;
     bench.record_step(&mut passes)?;
@@ -131,14 +160,14 @@ pub fn time_kernels(
     }
     let peak_bytes = gpu.peak_bytes();
     let (step_visible_millis, _) = bench.time(&mut passes, repeats, KernelBench::record_step_visible)?;
-    let n_visible = bench.n_visible()?;
+    let n_splats_in_view = bench.n_splats_in_view()?;
     Ok(KernelFigures {
-        n_intersections,
+        work: WorkCounts::read(gpu, &bench.scratch, &bench.image_buffers, bench.splats.n_splats, setup.size_px)?,
         render_millis,
         packed_millis,
         step_millis,
         step_visible_millis,
-        n_visible,
+        n_splats_in_view,
         render_wall_millis,
         step_wall_millis,
         mean_rgb,
@@ -148,7 +177,8 @@ pub fn time_kernels(
 }
 
 impl KernelBench {
-    fn new(gpu: Arc<Gpu>, cloud: &SplatArrays, size_px: [u32; 2], eye: Eye) -> Result<Self, Error> {
+    fn new(gpu: Arc<Gpu>, cloud: &SplatArrays, setup: KernelSetup) -> Result<Self, Error> {
+        let KernelSetup { size_px, eye, losses } = setup;
         let draw = DrawPipelines::new(&gpu)?;
         let train = TrainPipelines::new(&gpu)?;
         let n_splats =
@@ -171,6 +201,12 @@ impl KernelBench {
         let noise: Vec<u32> = (0..n_pixels)
             .map(|pixel| pixel.wrapping_mul(2_654_435_761).rotate_left(11).wrapping_mul(0x85eb_ca6b) | 0xff00_0000)
             .collect();
+        let (depth_m, supervision) = match losses {
+            Losses::L1 => (0.0, <Supervision as bytemuck::Zeroable>::zeroed()),
+            Losses::Training => {
+                (DEPTH_M, Scarcity::of_images(N_IMAGES).supervision(&SplatOptions::default(), [0.0; 3]))
+            }
+        };
         let tiles = n_tiles(size_px);
         let initial_size = ScratchSize { n_splats, n_entries: 1 << 14, n_slots: 1 << 14, n_bins: n_bins(size_px) };
         let mut counters = [0u32; status::LEN];
@@ -181,8 +217,8 @@ impl KernelBench {
             status: gpu.storage_with("bench.status", bytemuck::cast_slice(&counters))?,
             view: gpu.uniform_with("bench.view", &camera.view()),
             image: gpu.storage_with("bench.target", bytemuck::cast_slice(&noise))?,
-            depth: gpu.storage("bench.depth", 4 * u64::from(n_pixels))?,
-            supervision: gpu.uniform_with("bench.supervision", &<Supervision as bytemuck::Zeroable>::zeroed()),
+            depth: gpu.storage_with("bench.depth", bytemuck::cast_slice(&vec![depth_m; n_pixels as usize]))?,
+            supervision: gpu.uniform_with("bench.supervision", &supervision),
             gains: gpu.storage_with("bench.gains", bytemuck::cast_slice(&[1.0f32; 4]))?,
             rule: gpu.uniform_with("bench.rule", &rule()),
             rule_visible: gpu.uniform_with("bench.rule_touched", &Rule { update_all: 0, ..rule() }),
@@ -191,6 +227,7 @@ impl KernelBench {
             train,
             splats,
             size_px,
+            losses,
             gpu,
         })
     }
@@ -277,7 +314,7 @@ impl KernelBench {
                 depth: &self.depth,
                 supervision: &self.supervision,
                 gains: &self.gains,
-                ssim: false,
+                ssim: self.losses == Losses::Training,
             },
         );
         view
@@ -287,7 +324,7 @@ impl KernelBench {
         passes.dispatch(&self.gpu, &self.train.advance, 1, &[("status", &self.status)]);
     }
 
-    fn n_visible(&self) -> Result<u64, Error> {
+    fn n_splats_in_view(&self) -> Result<u64, Error> {
         let tile_counts: Vec<u32> = self.gpu.read(&self.scratch.tile_counts, self.splats.n_splats as usize)?;
         Ok(tile_counts.iter().filter(|n_tiles| **n_tiles > 0).count() as u64)
     }

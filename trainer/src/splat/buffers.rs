@@ -7,12 +7,22 @@ use crate::Error;
 use crate::gpu::{Buffer, Gpu, Passes};
 use crate::sort::SortBuffers;
 
-/// Splats per block, consecutive in depth. This constant and the next two equal those in shared/bins.wgsl.
+/// Splats per block, consecutive in depth. This constant and the next two are those of shared/bins.wgsl.
 pub(crate) const BLOCK: u32 = 256;
 /// Bins per workgroup.
 pub(crate) const WINDOW_BINS: u32 = 256;
 /// Blocks per group.
 pub(crate) const GROUP: u32 = 16;
+
+/// Constants of shared/segment.wgsl.
+const SEGMENT_SPLATS: u32 = 128;
+const TARGET_SEGMENTS: u32 = 16384;
+const N_STATE_PARTS: u32 = 5;
+const STATE_PAIRS: u32 = 128;
+const HIDDEN_ENTRIES: u32 = 1024;
+
+/// Tiles per bin.
+const TILES_PER_BIN: u32 = 16;
 
 /// Number of buffers with one entry per splat.
 pub(crate) const N_PLANAR_BUFFERS: usize = 9;
@@ -267,7 +277,9 @@ impl Scratch {
         let ScratchSize { n_splats, n_entries, n_slots, n_bins } = size;
         let n_blocks = n_splats.div_ceil(BLOCK);
         let n_segments = if n_slots > 0 && pipelines.has_segments { n_segments(n_entries, n_slots) } else { [0; 2] };
-        let segment_bytes = 16 * (u64::from(n_segments[0]) + u64::from(n_segments[1]) + 48 * u64::from(n_bins));
+        let n_of_tiles = 3 * TILES_PER_BIN * n_bins; // The first segment and two pieces of each tile.
+        let segment_bytes = 16 * (u64::from(n_segments[0]) + u64::from(n_segments[1]) + u64::from(n_of_tiles));
+        let state_bytes = u64::from(4 * N_STATE_PARTS * 2 * STATE_PAIRS);
         let per_bin = |name: &str, n: u32| gpu.storage(name, 4 * u64::from(n_bins) * u64::from(n.max(1)));
         Ok(Self {
             n_entries,
@@ -290,7 +302,7 @@ impl Scratch {
             camera_sums: gpu.storage("splat.camera_sums", if n_slots > 0 { 48 * u64::from(n_blocks) } else { 0 })?,
             segments: gpu.storage("splat.segments", segment_bytes)?,
             segment_counts: words("splat.segment_counts", 2)?,
-            segment_states: gpu.storage("splat.segment_states", 20 * 256 * u64::from(n_segments[0]))?,
+            segment_states: gpu.storage("splat.segment_states", state_bytes * u64::from(n_segments[0]))?,
             n_segments,
         })
     }
@@ -299,7 +311,7 @@ impl Scratch {
 /// Maximum number of segments after the first of each tile, and of pieces of hidden ends (without two per tile), for
 /// lists of this length; see shared/segment.wgsl.
 fn n_segments(n_entries: u32, n_slots: u32) -> [u32; 2] {
-    [(n_slots / 128).min(2 * 16384), n_entries.div_ceil(64)]
+    [(n_slots / SEGMENT_SPLATS).min(2 * TARGET_SEGMENTS), n_entries.div_ceil(HIDDEN_ENTRIES / TILES_PER_BIN)]
 }
 
 /// Buffers of one picture, and of its gradients in training.
@@ -351,4 +363,29 @@ pub(crate) fn n_bins(size_px: [u32; 2]) -> u32 {
 /// Number of tiles in an image.
 pub(crate) fn n_tiles(size_px: [u32; 2]) -> u32 {
     size_px[0].div_ceil(TILE_PX) * size_px[1].div_ceil(TILE_PX)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::gpu::testing::constant_in_wgsl;
+    use crate::splat::kernels::KERNELS;
+
+    #[test]
+    fn constants_equal_those_in_wgsl() {
+        let in_rust = [
+            ("BLOCK", BLOCK),
+            ("WINDOW_BINS", WINDOW_BINS),
+            ("GROUP", GROUP),
+            ("SEGMENT_SPLATS", SEGMENT_SPLATS),
+            ("TARGET_SEGMENTS", TARGET_SEGMENTS),
+            ("N_STATE_PARTS", N_STATE_PARTS),
+            ("STATE_PAIRS", STATE_PAIRS),
+            ("HIDDEN_ENTRIES", HIDDEN_ENTRIES),
+        ];
+        for (name, value) in in_rust {
+            assert_eq!(constant_in_wgsl(KERNELS, name), value, "{name}");
+        }
+        assert_eq!(constant_in_wgsl(KERNELS, "BIN_TILES").pow(2), TILES_PER_BIN, "along both axes of the image");
+    }
 }

@@ -14,6 +14,19 @@ use zip::result::ZipError;
 const SH_DEGREE: u32 = 3;
 const N_COEFFICIENTS: usize = 16;
 
+/// Patches of [`scan_cloud`]: center and standard deviation, meters.
+const PATCHES: [([f64; 2], f64); 4] =
+    [([-0.5, 0.2], 0.1), ([0.3, -0.3], 0.14), ([0.7, 0.4], 0.2), ([-1.1, -0.6], 0.14)];
+/// Fractions of the splats in patches, and of large splats.
+const PATCH_FRAC: f64 = 0.25;
+const LARGE_FRAC: f64 = 0.005;
+/// Number of splats that cover the whole image.
+const N_HUGE: usize = 3;
+/// Median sizes (standard deviations) in meters, times the square root of the number of splats.
+const WALL_SIZE: f64 = 5.6;
+const PATCH_SIZE: f64 = 1.9;
+const LARGE_SIZE: f64 = 60.0;
+
 /// Generates `n_splats` random splats of SH degree 3. Equal seeds give equal splats.
 ///
 /// Means are uniform in the cube from -1 to 1. All other values are normally distributed. Log scales have a mean of
@@ -29,10 +42,54 @@ pub fn synthetic_cloud(n_splats: usize, seed: u64) -> SplatArrays {
         splats.log_scales.push(std::array::from_fn(|_| (typical_log_scale + 0.3 * random.normal()) as f32));
         splats.rotations_wxyz.push(std::array::from_fn(|_| random.normal() as f32));
         splats.opacity_logits.push((1.5 * random.normal()) as f32);
-        for coefficient_ix in 0..N_COEFFICIENTS {
-            let deviation = if coefficient_ix == 0 { 0.5 } else { 0.2 };
-            splats.sh.push(std::array::from_fn(|_| (deviation * random.normal()) as f32));
-        }
+        splats.sh.extend(random_color(&mut random));
+    }
+    splats
+}
+
+/// Color coefficients of [`synthetic_cloud`].
+#[expect(clippy::cast_possible_truncation, reason = "drawn in f64, used in f32")]
+fn random_color(random: &mut Random) -> [[f32; 3]; N_COEFFICIENTS] {
+    std::array::from_fn(|coefficient_ix| {
+        let deviation = if coefficient_ix == 0 { 0.5 } else { 0.2 };
+        std::array::from_fn(|_| (deviation * random.normal()) as f32)
+    })
+}
+
+/// Generates `n_splats` splats like those of a scan with depth, for a camera at z = -3.2 that looks along z. Equal seeds
+/// give equal splats.
+///
+/// Most splats are flat and lie on an uneven wall around z = 0, whose edges are outside of an image with a focal length
+/// of 0.9 image widths. [`PATCH_FRAC`] of them are smaller and lie in a few [`PATCHES`], where the lists of the tiles are
+/// several times longer. [`LARGE_FRAC`] of them are large, and [`N_HUGE`] cover the whole image.
+#[expect(clippy::cast_possible_truncation, reason = "drawn in f64, used in f32")]
+pub fn scan_cloud(n_splats: usize, seed: u64) -> SplatArrays {
+    let mut random = Random::new(seed);
+    // The same number of splats per pixel gives the same size in pixels.
+    let scale_m = 1.0 / (n_splats as f64).sqrt();
+    let mut splats = SplatArrays { sh_degree: SH_DEGREE, ..SplatArrays::default() };
+    for splat_ix in 0..n_splats {
+        let kind = random.unit();
+        let (xy_m, size_m, depth_m) = if splat_ix < N_HUGE {
+            ([0.2 * random.normal(), 0.2 * random.normal()], 3.0, 0.0)
+        } else if kind < PATCH_FRAC {
+            let ([x_m, y_m], spread_m) = PATCHES[splat_ix % PATCHES.len()];
+            let xy_m = [x_m + spread_m * random.normal(), y_m + spread_m * random.normal()];
+            (xy_m, PATCH_SIZE * scale_m, 0.02 * random.normal())
+        } else {
+            let xy_m = [2.3 * (2.0 * random.unit() - 1.0), 1.8 * (2.0 * random.unit() - 1.0)];
+            let size = if kind > 1.0 - LARGE_FRAC { LARGE_SIZE } else { WALL_SIZE };
+            (xy_m, size * scale_m, 0.01 * random.normal())
+        };
+        let [x_m, y_m] = xy_m;
+        splats.means.push([x_m, y_m, 0.3 * (2.0 * x_m).sin() * (1.7 * y_m).cos() + depth_m].map(|m| m as f32));
+        let log_size = size_m.ln() + 0.5 * random.normal();
+        let flatness = [0.0, 0.4 * random.normal(), -2.0];
+        splats.log_scales.push(flatness.map(|along| (log_size + along) as f32));
+        // Roughly parallel to the wall.
+        splats.rotations_wxyz.push([1.0, 0.2, 0.2, 1.0].map(|deviation| (deviation * random.normal()) as f32));
+        splats.opacity_logits.push((1.5 * random.normal() - 1.5) as f32);
+        splats.sh.extend(random_color(&mut random));
     }
     splats
 }

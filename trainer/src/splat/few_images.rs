@@ -2,6 +2,8 @@
 //! with many images.
 
 use super::growth_search::FEW_IMAGES;
+use super::options::SplatOptions;
+use super::params::Supervision;
 use crate::gpu::f32_of;
 
 /// Up to this number of images, the regularization is complete.
@@ -33,13 +35,25 @@ impl Scarcity {
         self.0 * max * (completed_frac / DROP_RAMP_FRAC).min(1.0)
     }
 
+    /// Background and loss weights of a training step.
+    pub(crate) fn supervision(self, options: &SplatOptions, mean_srgb: [f32; 3]) -> Supervision {
+        let [red, green, blue] = self.min_background_srgb(mean_srgb, options.random_background);
+        Supervision {
+            background_srgb: [red, green, blue, 0.0],
+            dssim_frac: f32_of(options.dssim_frac),
+            depth_weight: f32_of(options.depth_per_m * self.depth_weight()),
+            depth_clip_m: f32_of(self.depth_clip_m()),
+            random_background: f32_of(options.random_background),
+        }
+    }
+
     /// Depth residuals above this limit have no gradient, meters.
-    pub(crate) fn depth_clip_m(self) -> f64 {
+    fn depth_clip_m(self) -> f64 {
         self.between(DEPTH_CLIP_M, FEW_DEPTH_CLIP_M)
     }
 
     /// Factor of the weight of the depth loss.
-    pub(crate) fn depth_weight(self) -> f64 {
+    fn depth_weight(self) -> f64 {
         self.between(1.0, FEW_DEPTH_WEIGHT)
     }
 
@@ -50,7 +64,7 @@ impl Scarcity {
 
     /// Lower end of the random background's range of colors during training. With few images, the range is centered at the
     /// mean color, as far as it fits into 0 to 1; with many images, it begins at black.
-    pub(crate) fn min_background_srgb(self, mean_srgb: [f32; 3], range: f64) -> [f32; 3] {
+    fn min_background_srgb(self, mean_srgb: [f32; 3], range: f64) -> [f32; 3] {
         mean_srgb.map(|color| f32_of(self.0 * (f64::from(color) - 0.5 * range).clamp(0.0, (1.0 - range).max(0.0))))
     }
 

@@ -39,8 +39,10 @@ mod training_tests;
 mod trial_tests;
 mod trials;
 mod views;
+mod work_counts;
 
 pub(crate) use entry::ENTRY;
 pub use options::SplatOptions;
 pub use trainer::SplatTrainer;
 pub use trials::CountPolicy;
+pub use work_counts::WorkCounts;

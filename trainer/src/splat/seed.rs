@@ -115,7 +115,7 @@ impl Seeder {
                 let down =
                     depth.point(x, y + stride, filled(neighbors[3])) - depth.point(x, y - stride, filled(neighbors[2]));
                 let normal = across.cross(&down).try_normalize(1e-12).unwrap_or_else(Vector3::z);
-                // On an oblique surface, the grid points are further apart.
+                // On an oblique surface, the grid points are farther apart.
                 let slant = (normal.dot(&here.normalize()).abs()).max(0.3);
                 let size_m =
                     [SPREAD * spacing_m / slant.sqrt(), SPREAD * spacing_m / slant.sqrt(), THICKNESS * spacing_m];

@@ -17,7 +17,6 @@ mod scoring;
 mod seeding;
 mod training;
 mod view_set;
-mod work_counts;
 
 use super::arrays::SplatArrays;
 use super::bounds::bounds;

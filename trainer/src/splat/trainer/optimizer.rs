@@ -5,7 +5,7 @@ use super::model::TrainedModel;
 use super::recorder::Recorder;
 use super::renderer::{self, Renderer};
 use crate::Error;
-use crate::gpu::{Buffer, Gpu, Passes, PendingRead, f32_of};
+use crate::gpu::{Buffer, Gpu, Passes, PendingRead};
 use crate::model_options::ModelOptions;
 use crate::splat::buffers::ImageBuffers;
 use crate::splat::few_images::Scarcity;
@@ -74,14 +74,7 @@ impl Optimizer {
 
     /// Uploads the loss weights of the next steps.
     pub(super) fn write_supervision(&self, gpu: &Gpu, options: &SplatOptions, scarcity: Scarcity, mean_srgb: [f32; 3]) {
-        let [red, green, blue] = scarcity.min_background_srgb(mean_srgb, options.random_background);
-        let supervision = Supervision {
-            background_srgb: [red, green, blue, 0.0],
-            dssim_frac: f32_of(options.dssim_frac),
-            depth_weight: f32_of(options.depth_per_m * scarcity.depth_weight()),
-            depth_clip_m: f32_of(scarcity.depth_clip_m()),
-            random_background: f32_of(options.random_background),
-        };
+        let supervision = scarcity.supervision(options, mean_srgb);
         gpu.write(&self.supervision, 0, bytemuck::bytes_of(&supervision));
     }
 
@@ -105,9 +98,9 @@ impl Optimizer {
         renderer::clear_failure(gpu, &self.status);
     }
 
-    /// One past the last splat that contributes to each pixel, counted from the start of the bin's list.
-    pub(super) fn last_contributors(&self) -> Result<&Buffer, Error> {
-        self.image_buffers.as_ref().map(|buffers| &buffers.last).ok_or(Error::DeviceLost)
+    /// Buffers of the picture of the latest step.
+    pub(super) fn image_buffers(&self) -> Result<&ImageBuffers, Error> {
+        self.image_buffers.as_ref().ok_or(Error::DeviceLost)
     }
 
     /// Allocates the buffers for training up to `capacity` splats on images of this size.

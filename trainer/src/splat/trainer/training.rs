@@ -9,6 +9,7 @@ use crate::gpu::{PassTiming, f32_of};
 use crate::splat::few_images::Scarcity;
 use crate::splat::kernels::TrainPipelines;
 use crate::splat::params::status;
+use crate::splat::work_counts::WorkCounts;
 use std::time::Instant;
 
 /// Maximum number of steps per submit.
@@ -59,15 +60,10 @@ impl SplatTrainer {
         self.record_step(&learn, self.schedule.step)?;
         let timings = self.recorder.passes.submit_timed(&self.recorder.gpu)?;
         let place = self.views.of_step(self.schedule.step);
-        let counts = self.work_counts(self.views.size_px(place))?;
-        log::info!(
-            "splat: {} intersections of splats and tiles, {} visible; longest tile list {}, most visible in one tile {}; largest splat touches {} tiles",
-            counts.n_intersections,
-            counts.n_visible,
-            counts.longest_list,
-            counts.longest_visible,
-            counts.largest_splat
-        );
+        let (gpu, n_splats, size_px) = (&self.recorder.gpu, self.model.splats.n_splats, self.views.size_px(place));
+        let image_buffers = self.optimizer.image_buffers()?;
+        let counts = WorkCounts::read(gpu, self.renderer.scratch()?, image_buffers, n_splats, size_px)?;
+        log::info!("splat: {counts}");
         self.schedule.step += 1;
         Ok(timings)
     }

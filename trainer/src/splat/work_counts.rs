@@ -1,35 +1,44 @@
 //! Counts that explain the time of a step.
 
-use super::SplatTrainer;
+use super::buffers::{ImageBuffers, Scratch, n_bins, n_tiles};
+use super::params::TILE_PX;
 use crate::Error;
-use crate::splat::buffers::{n_bins, n_tiles};
-use crate::splat::params::TILE_PX;
+use crate::gpu::Gpu;
+use serde::Serialize;
+use std::fmt;
 
 /// Counts of the last view that was drawn.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub(super) struct WorkCounts {
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
+pub struct WorkCounts {
     /// Intersections of splats with tiles.
-    pub(super) n_intersections: u64,
+    pub n_intersections: u64,
     /// Intersections up to the last splat that contributes to a pixel of the tile.
-    pub(super) n_visible: u64,
+    pub n_visible: u64,
+    /// Number of tiles.
+    pub n_tiles: u64,
     /// Length of the longest tile list.
-    pub(super) longest_list: u64,
+    pub longest_list: u64,
     /// Maximum number of visible intersections in a tile; not necessarily the tile of `longest_list`.
-    pub(super) longest_visible: u64,
+    pub longest_visible: u64,
     /// Tiles that the largest splat touches.
-    pub(super) largest_splat: u64,
+    pub largest_splat: u64,
 }
 
-impl SplatTrainer {
+impl WorkCounts {
     /// Counts the work of the last view, whose size is `size_px`.
-    pub(super) fn work_counts(&self, size_px: [u32; 2]) -> Result<WorkCounts, Error> {
-        let gpu = &self.recorder.gpu;
-        let scratch = self.renderer.scratch()?;
+    pub(crate) fn read(
+        gpu: &Gpu,
+        scratch: &Scratch,
+        image_buffers: &ImageBuffers,
+        n_splats: u32,
+        size_px: [u32; 2],
+    ) -> Result<Self, Error> {
         let bin_starts: Vec<u32> = gpu.read(&scratch.bin_starts, n_bins(size_px) as usize + 1)?;
         let n_entries = bin_starts.last().copied().unwrap_or(0);
         let entries: Vec<[u32; 4]> = gpu.read(&scratch.entries, n_entries as usize)?;
-        let last: Vec<u32> = gpu.read(self.optimizer.last_contributors()?, (size_px[0] * size_px[1]) as usize)?;
-        let tile_counts: Vec<u32> = gpu.read(&scratch.tile_counts, self.model.splats.n_splats as usize)?;
+        // One past the last splat that contributes to each pixel, counted from the start of the bin's list.
+        let last: Vec<u32> = gpu.read(&image_buffers.last, (size_px[0] * size_px[1]) as usize)?;
+        let tile_counts: Vec<u32> = gpu.read(&scratch.tile_counts, n_splats as usize)?;
         let columns = size_px[0].div_ceil(TILE_PX);
         let mut past_last = vec![0; n_tiles(size_px) as usize];
         for (pixel, last) in (0u32..).zip(&last) {
@@ -37,9 +46,10 @@ impl SplatTrainer {
             past_last[tile as usize] = (*last).max(past_last[tile as usize]);
         }
         let bin_columns = columns.div_ceil(4);
-        let mut counts = WorkCounts {
+        let mut counts = Self {
+            n_tiles: past_last.len() as u64,
             largest_splat: tile_counts.iter().copied().max().unwrap_or(0).into(),
-            ..WorkCounts::default()
+            ..Self::default()
         };
         for (tile, past_last) in (0u32..).zip(past_last) {
             let (column, row) = (tile % columns, tile / columns);
@@ -54,5 +64,19 @@ impl SplatTrainer {
             counts.longest_visible = counts.longest_visible.max(n_visible);
         }
         Ok(counts)
+    }
+}
+
+impl fmt::Display for WorkCounts {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { n_intersections, n_visible, n_tiles, longest_list, longest_visible, largest_splat } = self;
+        let visible_percent = 100.0 * *n_visible as f64 / (*n_intersections).max(1) as f64;
+        let mean_list = n_intersections / (*n_tiles).max(1);
+        write!(
+            f,
+            "{n_intersections} intersections of splats and tiles, {visible_percent:.0} % visible; tile lists: mean \
+             {mean_list}, longest {longest_list}, most visible in one tile {longest_visible}; largest splat touches \
+             {largest_splat} of {n_tiles} tiles"
+        )
     }
 }
