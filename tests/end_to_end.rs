@@ -551,19 +551,12 @@ fn hand_eye(file: &Path) -> (Vec<f64>, Vec<f64>) {
     (numbers("xyz_m"), numbers("quat_xyzw"))
 }
 
-#[test]
-fn wrong_hand_eye_calibration_is_corrected() {
-    /// Half the scan; measured 0.003 degrees and 0.04 mm.
-    const N_IMAGES: i64 = 90;
-    const MAX_REMAINING_DEGREES: f64 = 0.1;
-    const MAX_REMAINING_MM: f64 = 0.5;
-    let folder = tempfile::tempdir().expect("a folder");
-    let folder = folder.path();
-    rig_file_for(folder, N_IMAGES);
+/// Records a scan of `n_images` and writes `wrong.toml`, whose hand-eye calibration is wrong by 5 mm, and by 1 degree
+/// about an axis of the camera.
+fn record_with_wrong_hand_eye(folder: &Path, n_images: i64, change: impl FnOnce(&mut toml::Table)) {
+    rig_file_for(folder, n_images);
     let record = fieldrig(folder, &["record", "rig.toml", "--sim", "--out", "scan.mcap"]);
     assert!(record.status.success(), "{}", String::from_utf8_lossy(&record.stderr));
-
-    // The error is 5 mm, and 1 degree about `axis` in the camera frame, multiplied from the right.
     let text = std::fs::read_to_string(folder.join("rig.toml")).expect("a rig file");
     let mut rig: toml::Table = text.parse().expect("TOML");
     let (right_m, right) = hand_eye(&folder.join("rig.toml"));
@@ -577,29 +570,71 @@ fn wrong_hand_eye_calibration_is_corrected() {
         w * z + c * half.cos() + a * y - b * x,
         w * half.cos() - a * x - b * y - c * z,
     ];
-    let pose = rig["camera"]["wrist"]["parent_from_camera"].as_table_mut().expect("a pose");
+    let wrist = rig["camera"]["wrist"].as_table_mut().expect("a camera");
+    let pose = wrist["parent_from_camera"].as_table_mut().expect("a pose");
     pose.insert("xyz_m".into(), vec![right_m[0] + 0.003, right_m[1] - 0.004, right_m[2]].into());
     pose.insert("quat_xyzw".into(), wrong.to_vec().into());
+    change(wrist);
     std::fs::write(folder.join("wrong.toml"), rig.to_string()).expect("the disk has space");
+}
+
+/// Error of the hand-eye calibration in a rig file, degrees and millimeters.
+fn hand_eye_error(folder: &Path, file: &str) -> (f64, f64) {
+    let [(right_m, right), (found_m, found)] = ["rig.toml", file].map(|file| hand_eye(&folder.join(file)));
+    let dot: f64 = found.iter().zip(&right).map(|(found, right)| found * right).sum();
+    let squares = found_m.iter().zip(&right_m).map(|(found, right)| (found - right).powi(2));
+    (2.0 * dot.abs().min(1.0).acos().to_degrees(), 1e3 * squares.sum::<f64>().sqrt())
+}
+
+#[test]
+fn without_depth_the_hand_eye_calibration_is_optimized_with_the_scene() {
+    const N_IMAGES: i64 = 90;
+    const MAX_REMAINING_DEGREES: f64 = 0.6;
+    const MAX_REMAINING_MM: f64 = 5.0;
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    record_with_wrong_hand_eye(folder, N_IMAGES, |wrist| drop(wrist.remove("depth")));
+    std::fs::create_dir(folder.join("found")).expect("the disk has space");
+    let common = ["--refine", "extrinsics", "--steps", "400", "--max-splats", "2000", "--json"];
+    let train = ["train", "scan.mcap", "--rig", "wrong.toml", "--write-rig", "found/rig.toml", "--out", "train"];
+    let run = ["run", "wrong.toml", "--from", "scan.mcap", "--listen", "127.0.0.1:0", "--out", "live"];
+    for (command, folder_of_run, rig) in
+        [(&train[..], "train", "found/rig.toml"), (&run, "live", "live/corrected-rig.toml")]
+    {
+        events(folder, &[command, &common].concat());
+        let (degrees, mm) = hand_eye_error(folder, rig);
+        println!("{folder_of_run}: {degrees:.3} degrees, {mm:.2} mm left");
+        assert!(degrees < MAX_REMAINING_DEGREES && mm < MAX_REMAINING_MM, "{degrees:.3} degrees, {mm:.2} mm left");
+        let report = std::fs::read_to_string(folder.join(folder_of_run).join("report.json")).expect("a report");
+        let report: Value = serde_json::from_str(&report).expect("JSON");
+        let rotation_rad: Vec<f64> =
+            serde_json::from_value(report["cameras"]["wrist"]["rotation_rad"].clone()).expect("numbers");
+        assert!(report["alignment"].is_null() && rotation_rad.iter().any(|part| part.abs() > 1e-3), "{rotation_rad:?}");
+    }
+}
+
+#[test]
+fn wrong_hand_eye_calibration_is_corrected() {
+    /// Half the scan; measured 0.003 degrees and 0.04 mm.
+    const N_IMAGES: i64 = 90;
+    const MAX_REMAINING_DEGREES: f64 = 0.1;
+    const MAX_REMAINING_MM: f64 = 0.5;
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    record_with_wrong_hand_eye(folder, N_IMAGES, |_| ());
 
     std::fs::create_dir(folder.join("found")).expect("the disk has space");
     let args = ["train", "scan.mcap", "--rig", "wrong.toml", "--refine", "auto", "--steps", "8", "--out", "out"];
     let printed = events(folder, &[&args[..], &["--write-rig", "found/rig.toml", "--json"]].concat());
     assert_eq!(printed.last().expect("events")["event"], "done");
-    let remaining = |file: &str| {
-        let (found_m, found) = hand_eye(&folder.join(file));
-        let dot: f64 = found.iter().zip(&right).map(|(found, right)| found * right).sum();
-        let squares = found_m.iter().zip(&right_m).map(|(found, right)| (found - right).powi(2));
-        (2.0 * dot.abs().min(1.0).acos().to_degrees(), 1e3 * squares.sum::<f64>().sqrt())
-    };
-    let (degrees, mm) = remaining("found/rig.toml");
+    let (degrees, mm) = hand_eye_error(folder, "found/rig.toml");
     assert!(degrees < MAX_REMAINING_DEGREES && mm < MAX_REMAINING_MM, "{degrees:.4} degrees, {mm:.3} mm left");
 
     // In real time, while the keyframes arrive. The decision log reproduces the moment of the correction.
     let args = ["run", "wrong.toml", "--from", "scan.mcap", "--real-time", "--seconds", "20", "--refine", "extrinsics"];
     let outputs = ["--max-splats", "3000", "--listen", "127.0.0.1:0", "--out", "live", "--json"];
     let live = events(folder, &[&args[..], &outputs[..]].concat()).pop().expect("events");
-    let (degrees, mm) = remaining("live/corrected-rig.toml");
+    let (degrees, mm) = hand_eye_error(folder, "live/corrected-rig.toml");
     assert!(
         degrees < 2.0 * MAX_REMAINING_DEGREES && mm < 2.0 * MAX_REMAINING_MM,
         "{degrees:.4} degrees, {mm:.3} mm left"

@@ -1,9 +1,10 @@
 //! Runs alignment in parallel with training. Alignment starts with the first training step, on its own thread; its
 //! result is applied at a fixed step.
 
-use crate::registration::{Alignment, align};
+use crate::registration::{Alignment, CameraMovement, MovementDetector, align};
 use crate::{CalibratedCamera, CameraCorrection, CameraRefinement, Error};
 use keyframe::Keyframe;
+use kinematics::Stamp;
 use std::sync::Arc;
 use std::thread::JoinHandle;
 
@@ -74,8 +75,13 @@ impl AlignmentTask {
     }
 
     /// Starts alignment of uncorrected keyframes on its own thread.
-    pub fn begin(&mut self, keyframes: Vec<Arc<Keyframe>>, choice: &CameraRefinement) {
+    pub fn begin(&mut self, keyframes: &[Arc<Keyframe>], choice: &CameraRefinement) {
         let choice = choice.clone();
+        let with_movements = |keyframe: &Arc<Keyframe>| match &self.result {
+            Some(result) => result.with_movements(keyframe),
+            None => keyframe.clone(),
+        };
+        let keyframes: Vec<_> = keyframes.iter().map(with_movements).collect();
         self.state =
             TaskState::Running(std::thread::spawn(move || run_in_background_pool(|| align(&keyframes, &choice))));
     }
@@ -88,7 +94,10 @@ impl AlignmentTask {
         for line in result.iter().flat_map(Alignment::lines) {
             log::info!("{line}");
         }
-        let Some(result) = result else { return Ok(false) };
+        let Some(mut result) = result else { return Ok(false) };
+        if let Some(latest) = &self.result {
+            result.movements.clone_from(&latest.movements);
+        }
         let is_changed = match &self.result {
             None => result.has_corrections(),
             Some(latest) => keyframes.iter().any(|keyframe| latest.differs(&result, keyframe)),
@@ -99,30 +108,94 @@ impl AlignmentTask {
         Ok(is_changed)
     }
 
-    fn correction(&self, camera: &str) -> Option<&CameraCorrection> {
-        self.result()?.corrections.get(camera)
+    /// Adds a movement of a camera to the result; see [`Alignment::add_movement`].
+    pub fn add_movement(&mut self, movement: CameraMovement, first: Stamp) {
+        self.result.get_or_insert_default().add_movement(movement, first);
     }
 
     /// The keyframe with the corrections of alignment, if there are any.
     pub fn corrected(&self, keyframe: &Arc<Keyframe>) -> Arc<Keyframe> {
-        match self.correction(&keyframe.camera) {
-            Some(correction) => Arc::new(correction.corrected(keyframe)),
-            None => keyframe.clone(),
-        }
+        self.result.as_ref().map_or_else(|| keyframe.clone(), |result| result.corrected(keyframe))
     }
 
     /// The camera of a keyframe with the corrections of alignment, followed by the corrections that were learned with
     /// the splats.
     pub fn calibrated_camera(&self, keyframe: &Keyframe, learned: Option<&CameraCorrection>) -> CalibratedCamera {
-        let posed = |keyframe: &Keyframe| {
-            learned.map_or_else(|| CalibratedCamera::of(keyframe), |correction| correction.apply(keyframe))
+        match &self.result {
+            Some(alignment) => alignment.camera(keyframe, learned),
+            None => Alignment::default().camera(keyframe, learned),
+        }
+    }
+}
+
+/// Detection of camera movements in the background, in keyframes that have the corrections of alignment.
+#[derive(Debug)]
+pub struct MovementTask {
+    worker: Worker,
+    /// Keyframes to judge, in order of arrival.
+    pending: Vec<Arc<Keyframe>>,
+}
+
+#[derive(Debug)]
+enum Worker {
+    /// The detector has not been created from its reference keyframes.
+    New(Vec<Arc<Keyframe>>),
+    Idle(MovementDetector),
+    Running(JoinHandle<(MovementDetector, Option<CameraMovement>)>),
+    /// A movement was found.
+    Done,
+}
+
+impl MovementTask {
+    /// Detection that compares keyframes with earlier ones.
+    pub fn new(references: Vec<Arc<Keyframe>>) -> Self {
+        Self { worker: Worker::New(references), pending: Vec::new() }
+    }
+
+    /// Adds a keyframe to judge.
+    pub fn push(&mut self, keyframe: Arc<Keyframe>) {
+        self.pending.push(keyframe);
+    }
+
+    /// Starts to judge the waiting keyframes on its own thread, unless it is running.
+    pub fn begin(&mut self) {
+        if self.pending.is_empty() {
+            return;
+        }
+        let detector: Box<dyn FnOnce() -> MovementDetector + Send> =
+            match std::mem::replace(&mut self.worker, Worker::Done) {
+                Worker::New(references) => Box::new(move || MovementDetector::new(&references)),
+                Worker::Idle(detector) => Box::new(move || detector),
+                busy => return self.worker = busy,
+            };
+        let keyframes = std::mem::take(&mut self.pending);
+        let judge = move || {
+            let mut detector = detector();
+            let movement = keyframes.iter().find_map(|keyframe| detector.push(keyframe));
+            (detector, movement)
         };
-        match self.correction(&keyframe.camera) {
-            Some(correction) => CalibratedCamera {
-                color_from_depth: keyframe.depth.as_ref().map(|depth| correction.color_from_depth(keyframe, depth)),
-                ..posed(&correction.corrected(&Keyframe { depth: None, ..keyframe.clone() }))
-            },
-            None => posed(keyframe),
+        self.worker = Worker::Running(std::thread::spawn(|| run_in_background_pool(judge)));
+    }
+
+    /// Returns a movement if one was found. With `wait`, judges all keyframes first.
+    pub fn poll(&mut self, wait: bool) -> Result<Option<CameraMovement>, Error> {
+        loop {
+            if wait {
+                self.begin();
+            }
+            match std::mem::replace(&mut self.worker, Worker::Done) {
+                Worker::Running(thread) if wait || thread.is_finished() => {
+                    let (detector, movement) = thread.join().map_err(|_| Error::AlignmentPanicked)?;
+                    if movement.is_some() {
+                        return Ok(movement);
+                    }
+                    self.worker = Worker::Idle(detector);
+                }
+                other => {
+                    self.worker = other;
+                    return Ok(None);
+                }
+            }
         }
     }
 }

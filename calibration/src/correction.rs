@@ -84,7 +84,22 @@ pub struct CalibratedCamera {
     pub gains: [f64; 3],
 }
 
+/// Smaller differences between two calibrations of a camera do not matter: rotation (0.03 degrees), translation, and
+/// relative difference of the focal length.
+const NOTICEABLE_RAD: f64 = 5e-4;
+const NOTICEABLE_M: f64 = 5e-4;
+const NOTICEABLE_FOCAL: f64 = 1e-3;
+
 impl CalibratedCamera {
+    /// Whether another calibration of the same image has a noticeably different pose or focal length.
+    pub fn differs_noticeably(&self, other: &Self) -> bool {
+        let motion = self.world_from_camera.inverse() * other.world_from_camera;
+        let focal_change = (0..2).map(|axis| (other.focal_px[axis] / self.focal_px[axis] - 1.0).abs());
+        motion.rotation.angle() > NOTICEABLE_RAD
+            || motion.translation.vector.norm() > NOTICEABLE_M
+            || focal_change.fold(0.0, f64::max) > NOTICEABLE_FOCAL
+    }
+
     /// The uncorrected camera of a keyframe.
     pub fn of(keyframe: &Keyframe) -> Self {
         Self {
@@ -102,6 +117,12 @@ impl CalibratedCamera {
 }
 
 impl CameraCorrection {
+    /// The correction without the parts that apply to single images.
+    #[must_use]
+    pub fn of_all_images(self) -> Self {
+        Self { drift: BTreeMap::new(), log_gains: BTreeMap::new(), appearance_embeddings: BTreeMap::new(), ..self }
+    }
+
     /// The corrected camera of a keyframe; [`CalibratedCamera::of`] is the uncorrected one.
     pub fn apply(&self, keyframe: &Keyframe) -> CalibratedCamera {
         let lens = CalibratedCamera::of(keyframe);

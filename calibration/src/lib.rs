@@ -30,14 +30,14 @@ mod registration;
 pub mod scenes;
 mod trial;
 
-pub use background::{AlignmentTask, alignment_step, run_in_background_pool};
+pub use background::{AlignmentTask, MovementTask, alignment_step, run_in_background_pool};
 pub use correction::{
     CalibratedCamera, CameraCorrection, EMBEDDING_DIM, drift_weight, interpolate, rigid_transform, shares_lens,
 };
 pub use error::Error;
 pub use params::ParamSet;
 pub use registration::{
-    Alignment, Estimate, PoseEstimate, ScalarEstimate, StationCorrection, Unobservable, align, candidates,
-    register_station,
+    Alignment, CameraMovement, Estimate, MOVEMENT_WINDOW, MovementDetector, PoseEstimate, ScalarEstimate,
+    StationCorrection, Unobservable, align, candidates, register_station,
 };
 pub use trial::{CameraRefinement, Candidate, MIN_VALIDATION_IMAGES, Trial, TrialReport};

@@ -1,22 +1,37 @@
-//! Writes a rig file with the calibration corrections that alignment estimated.
+//! Writes a rig file with the calibration corrections that were estimated.
 
 use crate::Error;
 use crate::error::Context;
 use calibration::{Alignment, CameraCorrection, Estimate};
 use capture::config::{Camera, Rig, TimeOffset};
-use kinematics::{Chain, Intrinsics, Transform};
+use kinematics::{Chain, Intrinsics, Stamp, Transform};
 use nalgebra::{Translation3, UnitQuaternion, Vector3};
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-/// Value of `source` for a corrected time offset.
-const SOURCE: &str = "registration of keyframes";
+/// Values of `source` for a corrected time offset.
+const ALIGNED: &str = "registration of keyframes";
+const LEARNED: &str = "optimization with the scene";
 
-/// The rig with all corrections applied. Per-image pose corrections have no key in a rig file and are left out.
-pub fn corrected(rig: &Rig, alignment: &Alignment) -> crate::Result<Rig> {
+/// The rig with the corrections of alignment, followed by those optimized with the scene. Corrections of single images
+/// have no key in a rig file and are left out.
+pub fn corrected(
+    rig: &Rig,
+    alignment: Option<&Alignment>,
+    learned: &BTreeMap<String, CameraCorrection>,
+) -> crate::Result<Rig> {
     let mut rig = rig.clone();
+    let unaligned = Alignment::default();
+    let alignment = alignment.unwrap_or(&unaligned);
     for camera in &mut rig.cameras {
+        if let Some(correction) = alignment.movement_correction(&camera.name, Stamp(i64::MAX)) {
+            correct(camera, &correction, &[], ALIGNED);
+        }
         if let Some(correction) = alignment.corrections.get(&*camera.name) {
-            correct(camera, correction, alignment);
+            correct(camera, correction, &alignment.estimates, ALIGNED);
+        }
+        if let Some(correction) = learned.get(&*camera.name) {
+            correct(camera, correction, &[], LEARNED);
         }
     }
     let joint_offsets =
@@ -63,7 +78,9 @@ pub fn write(rig: &Rig, file: &Path) -> crate::Result<()> {
     std::fs::write(file, rig.to_toml()).with_context(in_file)
 }
 
-fn correct(camera: &mut Camera, correction: &CameraCorrection, alignment: &Alignment) {
+/// Applies a correction. `estimates` contain the standard deviation of the time offset, if it is known; `source` is its
+/// origin.
+fn correct(camera: &mut Camera, correction: &CameraCorrection, estimates: &[Estimate], source: &str) {
     let moved = |rotation_rad: [f64; 3], translation_m: [f64; 3]| {
         Transform::from_parts(
             Translation3::from(Vector3::from(translation_m)),
@@ -72,7 +89,7 @@ fn correct(camera: &mut Camera, correction: &CameraCorrection, alignment: &Align
     };
     camera.parent_from_camera *= moved(correction.rotation_rad, correction.translation_m).inverse();
     if correction.time_offset_secs != 0.0 {
-        let sigma = alignment.estimates.iter().find_map(|estimate| match estimate {
+        let sigma = estimates.iter().find_map(|estimate| match estimate {
             Estimate::TimeOffset(time_offset) if *time_offset.camera == *camera.name => Some(time_offset.sigma),
             _ => None,
         });
@@ -80,7 +97,7 @@ fn correct(camera: &mut Camera, correction: &CameraCorrection, alignment: &Align
             value_millis: camera.stamp_to_mid_exposure.as_ref().map_or(0.0, |known| known.value_millis)
                 + 1e3 * correction.time_offset_secs,
             sigma_millis: 1e3 * sigma.unwrap_or(0.0),
-            source: SOURCE.to_owned(),
+            source: source.to_owned(),
         });
     }
     if correction.readout_secs != 0.0 {
@@ -110,7 +127,6 @@ fn correct(camera: &mut Camera, correction: &CameraCorrection, alignment: &Align
 mod tests {
     use super::*;
     use calibration::ScalarEstimate;
-    use std::collections::BTreeMap;
 
     const TOLERANCE: f64 = 1e-12; // Rounding errors of products of poses with elements near 1.
 
@@ -144,7 +160,7 @@ mod tests {
             })],
             ..Alignment::default()
         };
-        let calibrated_rig = corrected(&rig, &alignment).unwrap();
+        let calibrated_rig = corrected(&rig, Some(&alignment), &BTreeMap::new()).unwrap();
         let (before, after) = (&rig.cameras[0], &calibrated_rig.cameras[0]);
         // The correction is applied after camera_from_parent.
         let moved = Transform::new(Vector3::from(correction.translation_m), Vector3::from(correction.rotation_rad));
@@ -155,7 +171,7 @@ mod tests {
         assert!(
             (time_offset.value_millis - 4.0).abs() < TOLERANCE && (time_offset.sigma_millis - 0.1).abs() < TOLERANCE
         );
-        assert_eq!(time_offset.source, SOURCE);
+        assert_eq!(time_offset.source, ALIGNED);
         assert!((after.readout_micros.unwrap() - 12_000.0).abs() < 1e-6);
         assert!((after.intrinsics.focal_px[0] / before.intrinsics.focal_px[0] - 0.01f64.exp()).abs() < TOLERANCE);
         let [fx, fy] = before.intrinsics.focal_px;

@@ -5,6 +5,7 @@ use crate::recoveries::{self, OpenGpu, Recoveries};
 use crate::render_budget::RenderBudget;
 use crate::session::Session;
 use crate::{scene_hint, time_slices};
+use calibration::CalibratedCamera;
 use capture::{Change, Feed, FeedItem, InputResult};
 use keyframe::{Keyframe, Split};
 use std::sync::Arc;
@@ -63,6 +64,8 @@ pub struct Live {
     /// Session whose latest score is refreshed next.
     next_refreshed: usize,
     published: Option<Instant>,
+    /// Corrected cameras of the published keyframes.
+    published_cameras: Vec<CalibratedCamera>,
     scoring_time: Duration,
     notes: Vec<String>,
     recoveries: Recoveries,
@@ -86,6 +89,7 @@ impl Live {
             budget: RenderBudget::new(is_software),
             next_refreshed: 0,
             published: None,
+            published_cameras: Vec::new(),
             scoring_time: Duration::ZERO,
             notes: options.notes,
             recoveries: Recoveries::new(options.open_gpu),
@@ -103,10 +107,27 @@ impl Live {
         self
     }
 
-    /// Publishes the keyframes with the corrections of the first model.
-    fn publish_keyframes(&self) {
-        let session = &self.sessions[0];
-        self.hub.set_keyframes(self.keyframes.iter().map(|keyframe| frustum(session, keyframe)).collect());
+    /// Publishes the keyframes and the corrections of live images, as estimated by the first model.
+    fn publish_keyframes(&mut self) {
+        let cameras: Vec<_> = self.keyframes.iter().map(|keyframe| self.sessions[0].camera_of(keyframe)).collect();
+        let posed = || self.keyframes.iter().zip(&cameras);
+        // Live images get the correction of their camera's newest keyframe.
+        let correction = |(keyframe, camera): (&Arc<Keyframe>, &CalibratedCamera)| {
+            (keyframe.camera.clone(), keyframe.world_from_camera.inverse() * camera.world_from_camera)
+        };
+        self.hub.set_camera_corrections(posed().map(correction).collect());
+        self.hub.set_keyframes(posed().map(|(keyframe, camera)| frustum(keyframe, camera)).collect());
+        self.published_cameras = cameras;
+    }
+
+    /// Publishes the keyframes again if corrections have moved one of them noticeably.
+    fn publish_moved_keyframes(&mut self) {
+        let has_moved = |(keyframe, published): (&Arc<Keyframe>, &CalibratedCamera)| {
+            self.sessions[0].camera_of(keyframe).differs_noticeably(published)
+        };
+        if self.keyframes.iter().zip(&self.published_cameras).any(has_moved) {
+            self.publish_keyframes();
+        }
     }
 
     /// Applies the results of alignments that are ready.
@@ -378,10 +399,14 @@ impl Live {
             if session.progress().step > 0 {
                 session.n_total_steps()?;
                 session.refresh_psnr()?;
+                // No work is queued here, so reading the corrections does not delay training.
+                session.refresh_corrections()?;
             }
             self.scoring_time += before.elapsed();
             self.budget.add_training(before.elapsed());
+            self.publish_moved_keyframes();
         }
+        let movements = self.sessions[0].alignment().map_or(&[][..], |alignment| &alignment.movements[..]);
         let mut models = self.sessions.iter().map(model_status);
         self.hub.set_status(Status {
             state: self.state().to_owned(),
@@ -390,7 +415,7 @@ impl Live {
             rejected: self.feed.rejected(),
             model: models.next().unwrap_or_default(),
             others: models.collect(),
-            notes: self.notes.clone(),
+            notes: self.notes.iter().cloned().chain(movements.iter().map(ToString::to_string)).collect(),
             result: None,
         });
         Ok(())
@@ -515,12 +540,12 @@ fn model_status(session: &Session) -> ModelStatus {
     }
 }
 
-fn frustum(session: &Session, keyframe: &Keyframe) -> KeyframePose {
+fn frustum(keyframe: &Keyframe, camera: &CalibratedCamera) -> KeyframePose {
     KeyframePose {
         camera: keyframe.camera.clone(),
-        world_from_camera: session.aligned_pose(keyframe),
+        world_from_camera: camera.world_from_camera,
         size_px: keyframe.size_px,
-        focal_px: keyframe.focal_px,
-        principal_px: keyframe.principal_px,
+        focal_px: camera.focal_px,
+        principal_px: camera.principal_px,
     }
 }

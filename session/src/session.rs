@@ -21,13 +21,14 @@ use crate::gpu_loss;
 use crate::next_commands::DataSource;
 use crate::observer::{Evaluation, Observer};
 use crate::recovery::Recovery;
-use calibration::Alignment;
+use calibration::{Alignment, CalibratedCamera, CameraCorrection};
 use capture::Stop;
 use keyframe::Keyframe;
-use kinematics::{Stamp, Transform};
+use kinematics::Stamp;
 use persistence::Persistence;
 use reporter::Reporter;
 use scoreboard::Scoreboard;
+use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use trainer::gpu::Gpu;
@@ -43,6 +44,8 @@ pub struct Session {
     gpu: Arc<Gpu>,
     /// Keyframes in the store, in order of arrival.
     keyframes: Vec<Arc<Keyframe>>,
+    /// Corrections optimized with the scene, as last read.
+    learned: BTreeMap<String, CameraCorrection>,
     time: TrainingTime,
     scoreboard: Scoreboard,
     persistence: Persistence,
@@ -64,6 +67,7 @@ impl Session {
             method,
             gpu,
             keyframes: Vec::new(),
+            learned: BTreeMap::new(),
             time: TrainingTime::new(limits),
             scoreboard: Scoreboard::new(evaluators),
             persistence: Persistence::default(),
@@ -262,15 +266,30 @@ impl Session {
     pub fn poll_alignment(&mut self, wait: bool) -> crate::Result<bool> {
         let is_applied = self.method.poll_alignment(wait)?;
         if is_applied {
+            self.refresh_corrections()?;
             self.persistence.log_alignment(self.method.as_mut())?;
         }
         Ok(is_applied)
     }
 
-    /// Pose of a keyframe's camera with the corrections of alignment.
-    pub fn aligned_pose(&self, keyframe: &Keyframe) -> Transform {
-        let correction = self.method.alignment().and_then(|alignment| alignment.corrections.get(&*keyframe.camera));
-        correction.map_or(keyframe.world_from_camera, |correction| correction.apply(keyframe).world_from_camera)
+    /// Camera of a keyframe with the corrections of alignment and those that [`Self::refresh_corrections`] has read.
+    pub fn camera_of(&self, keyframe: &Keyframe) -> CalibratedCamera {
+        let learned = self.learned.get(&*keyframe.camera);
+        match self.method.alignment() {
+            Some(alignment) => alignment.camera(keyframe, learned),
+            None => Alignment::default().camera(keyframe, learned),
+        }
+    }
+
+    /// Reads the corrections that are optimized with the scene, for [`Self::camera_of`]. Waits for queued work.
+    pub fn refresh_corrections(&mut self) -> crate::Result<()> {
+        self.learned = self.method.camera_corrections()?;
+        Ok(())
+    }
+
+    /// Corrections of cameras that were optimized with the scene; they follow those of [`Self::alignment`].
+    pub fn camera_corrections(&mut self) -> crate::Result<BTreeMap<String, CameraCorrection>> {
+        Ok(self.method.camera_corrections()?)
     }
 
     /// Trains for one time slice on a shared device, at most `max_steps` steps. Queued work is complete when this

@@ -291,7 +291,13 @@ pub(super) fn start(
     let pace = args.pace(&rig)?;
     let gpu = open_gpu()?;
     let RefineSettings { align, with_scene: cameras } = training.refining_live(available, gpu.is_software())?;
-    let common = CommonOptions { cameras, align, align_timing: pace.align_timing(), ..common };
+    let common = CommonOptions {
+        cameras,
+        align,
+        align_timing: pace.align_timing(),
+        detects_movements: !rig.has_moving_base(),
+        ..common
+    };
     let mut models: Vec<Resumed> = match previous {
         Some(previous) => vec![trainer::resume(gpu.clone(), &previous.checkpoint, &previous.keyframes)?],
         None => {
@@ -421,7 +427,7 @@ fn save(
     let n_train = live.keyframes().iter().filter(|keyframe| keyframe.split == Split::Train).count();
     let position_error_m = max_position_error_m(live.keyframes());
     let recoverable = live.describe_recoverable();
-    let (sessions, input_result) = live.finish();
+    let (mut sessions, input_result) = live.finish();
     let input_result = match input_result {
         Ok(input_result) => input_result,
         Err(error) => {
@@ -450,7 +456,7 @@ fn save(
     let is_recorded = input_result.recording_error.is_none();
     data_losses.extend(input_result.recording_error.map(|error| format!("the recording is incomplete: {error:#}")));
     data_losses.extend(damage.get().cloned());
-    let corrected = corrected_rigs(rig, &sessions, &folders);
+    let corrected = corrected_rigs(rig, &mut sessions, &folders);
     let stations = input_result.stations.as_ref().map_or(Vec::new(), |stations| stations.reports().to_vec());
     let ending = |(session, out): (Session, PathBuf)| EndingSession {
         details: RunDetails {
@@ -492,13 +498,17 @@ fn save(
     Ok((exit::from_losses(&data_losses), models))
 }
 
-/// The corrected rig files, with their paths, of the models whose cameras were corrected by alignment.
-fn corrected_rigs(rig: &Rig, sessions: &[Session], folders: &[PathBuf]) -> session::Result<Vec<(Rig, PathBuf)>> {
-    let aligned = sessions.iter().zip(folders).filter_map(|(session, folder)| {
-        let alignment = session.alignment().filter(|alignment| alignment.has_corrections())?;
-        Some(corrected_rig::corrected(rig, alignment).map(|rig| (rig, folder.join(CORRECTED_RIG))))
-    });
-    aligned.collect()
+/// The corrected rig files, with their paths, of the models whose cameras were corrected.
+fn corrected_rigs(rig: &Rig, sessions: &mut [Session], folders: &[PathBuf]) -> session::Result<Vec<(Rig, PathBuf)>> {
+    let mut rigs = Vec::new();
+    for (session, folder) in sessions.iter_mut().zip(folders) {
+        let learned = session.camera_corrections()?;
+        let corrected = corrected_rig::corrected(rig, session.alignment(), &learned)?;
+        if !corrected.has_same_calibration(rig) {
+            rigs.push((corrected, folder.join(CORRECTED_RIG)));
+        }
+    }
+    Ok(rigs)
 }
 
 /// Camera and stamp of a keyframe that was evicted for lack of memory.

@@ -7,7 +7,6 @@ use crate::exit::{self, BadArgument, Exit};
 use crate::open_gpu::open_gpu;
 use crate::training_args::TrainingArgs;
 use crate::{print, signals};
-use calibration::Alignment;
 use capture::StationReport;
 use capture::config::{Override, Rig};
 use keyframe::{Keyframe, Split, counted};
@@ -107,8 +106,6 @@ struct TrainDetails<'a> {
     /// Amount of depth that was rendered from a model.
     #[serde(skip_serializing_if = "Option::is_none")]
     rendered_depth: Option<&'a RenderedDepth>,
-    /// Calibration parameters estimated by registering images.
-    alignment: Option<Alignment>,
 }
 
 /// Loads the data, trains until a limit or Ctrl-C, scores on the evaluation schedule, and saves.
@@ -268,7 +265,8 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
         None => session::drive(&mut sessions, &untrained, preparation_time, &stop, open_gpu)?,
     }
 
-    let alignment = sessions.iter().find_map(Session::alignment).cloned();
+    let corrected =
+        args.write_rig.as_ref().map(|_| with_corrections(&Data::rig_as_given(&args.data, &images)?, &mut sessions));
     let startup_secs = sessions[0].clock_started().map_or(0.0, |at| (at - started).as_secs_f64());
     let ending = |((session, out), seed): ((Session, PathBuf), u64)| EndingSession {
         details: TrainDetails {
@@ -282,7 +280,6 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
             data_losses: &data.data_losses,
             stations: &data.stations,
             rendered_depth: data.rendered_depth.as_ref(),
-            alignment: session.alignment().cloned(),
         },
         session,
         out,
@@ -293,26 +290,30 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
     if !args.json {
         print_next_commands(&finished);
     }
-    if let Some(file) = &args.write_rig {
-        write_rig(&Data::rig_as_given(&args.data, &images)?, alignment.as_ref(), file)?;
+    if let (Some(file), Some(rig)) = (&args.write_rig, corrected) {
+        corrected_rig::write(&rig?, file)?;
+        log::info!("rig file written to {}", file.display());
     }
     Ok(exit::from_losses(&data.data_losses))
 }
 
-/// Writes the rig file and logs the reason if nothing changed in it.
-fn write_rig(rig: &Rig, alignment: Option<&Alignment>, file: &Path) -> anyhow::Result<()> {
-    match alignment {
-        None => log::warn!("images were not registered: the rig file is written unchanged"),
+/// The rig with the corrections of the first session that has any. Logs the reason if nothing changes.
+fn with_corrections(rig: &Rig, sessions: &mut [Session]) -> anyhow::Result<Rig> {
+    for session in &mut *sessions {
+        let learned = session.camera_corrections()?;
+        let corrected = corrected_rig::corrected(rig, session.alignment(), &learned)?;
+        if !corrected.has_same_calibration(rig) {
+            return Ok(corrected);
+        }
+    }
+    match sessions.iter().find_map(Session::alignment) {
+        None => log::warn!("no calibration was estimated: the rig file is written unchanged"),
         Some(alignment) if !alignment.has_enough_validation_images() => {
             log::warn!("too few validation images: the rig file is written unchanged");
         }
-        Some(alignment) if !alignment.has_corrections() => log::info!("the rig file needs no correction"),
-        Some(_) => {}
+        Some(_) => log::info!("the rig file needs no correction"),
     }
-    let rig = alignment.map_or_else(|| Ok(rig.clone()), |alignment| corrected_rig::corrected(rig, alignment))?;
-    corrected_rig::write(&rig, file)?;
-    log::info!("rig file written to {}", file.display());
-    Ok(())
+    Ok(rig.clone())
 }
 
 impl Args {

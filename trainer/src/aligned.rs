@@ -11,8 +11,10 @@ use crate::model_metadata::{METADATA_FILE, read_metadata};
 use crate::model_options::{AlignTiming, CommonOptions};
 use crate::{Bounds, Error, Method, Packing, Picture, Progress, QueuedPicture, RenderRequest, Rendered};
 use calibration::TrialReport;
-use calibration::{Alignment, AlignmentTask, alignment_step};
-use calibration::{CalibratedCamera, CameraCorrection, CameraRefinement};
+use calibration::{
+    Alignment, AlignmentTask, CalibratedCamera, CameraCorrection, CameraRefinement, MOVEMENT_WINDOW, MovementTask,
+    alignment_step,
+};
 use keyframe::{Keyframe, Split};
 use kinematics::Stamp;
 use serde::{Deserialize, Serialize};
@@ -46,11 +48,6 @@ pub trait Recalibrate: Method {
     /// * `keyframes`: in the order of their arrival, without test keyframes.
     /// * `alignment`: the source of the new corrections.
     fn recalibrate(&mut self, keyframes: &[CorrectedKeyframe], alignment: &Alignment) -> Result<(), Error>;
-    /// Correction of a camera that was optimized with the scene, relative to the pushed keyframes; `None` if there is
-    /// none.
-    fn learned_correction(&mut self, _camera: &str) -> Result<Option<CameraCorrection>, Error> {
-        Ok(None)
-    }
 }
 
 /// A resumed model, and the keyframes that it was not trained on.
@@ -75,6 +72,10 @@ pub struct Aligned<M> {
     begins_at: usize,
     /// Steps of the model before its last restart.
     n_steps_before_restart: u64,
+    /// Whether movements of cameras are detected after the first alignment of a live run.
+    detects_movements: bool,
+    /// Detection of movements, and the number of original keyframes that are its references.
+    movements: Option<(MovementTask, usize)>,
 }
 
 /// The alignment state in a checkpoint.
@@ -89,6 +90,9 @@ struct AlignedState {
     timing: AlignTiming,
     begins_at: usize,
     n_steps_before_restart: u64,
+    detects_movements: bool,
+    /// Number of keyframes that are the references of the detection of movements; `None` before it begins.
+    n_references: Option<usize>,
     /// Camera and stamp of the keyframes, until alignment is done.
     keyframes: Vec<(String, i64)>,
     n_begun: Option<usize>,
@@ -112,6 +116,8 @@ impl<M: Recalibrate + 'static> Aligned<M> {
             timing: AlignTiming::Once,
             begins_at: 0,
             n_steps_before_restart: 0,
+            detects_movements: false,
+            movements: None,
         }
     }
 
@@ -124,6 +130,7 @@ impl<M: Recalibrate + 'static> Aligned<M> {
         Box::new(Self {
             timing: common.align_timing,
             begins_at,
+            detects_movements: common.detects_movements && common.align_timing != AlignTiming::Once,
             ..Self::new(model, common.align.clone(), gpu.is_software(), common.n_planned_steps)
         })
     }
@@ -156,6 +163,8 @@ impl<M: Recalibrate + 'static> Aligned<M> {
             timing,
             begins_at,
             n_steps_before_restart,
+            detects_movements,
+            n_references,
             keyframes: ids,
             n_begun,
         } = serde_json::from_value(state).map_err(invalid_state)?;
@@ -170,7 +179,7 @@ impl<M: Recalibrate + 'static> Aligned<M> {
         let original_keyframes = ids.iter().filter_map(|(camera, nanos)| original((camera, *nanos))).collect();
         // Uncorrected, because `push` corrects them.
         let untrained = untrained.iter().filter_map(|keyframe| original(id_of(keyframe))).collect();
-        let aligned = Self {
+        let mut aligned = Self {
             model,
             choice,
             alignment_task,
@@ -181,7 +190,12 @@ impl<M: Recalibrate + 'static> Aligned<M> {
             timing,
             begins_at,
             n_steps_before_restart,
+            detects_movements,
+            movements: None,
         };
+        if let Some(n_references) = n_references {
+            aligned.detect_movements(n_references);
+        }
         Ok((Box::new(aligned), untrained))
     }
 
@@ -197,7 +211,7 @@ impl<M: Recalibrate + 'static> Aligned<M> {
         if self.timing != AlignTiming::RealTime {
             self.due_step.get_or_insert(from + self.alignment_steps);
         }
-        self.alignment_task.begin(self.original_keyframes[..n_begun].to_vec(), &self.choice);
+        self.alignment_task.begin(&self.original_keyframes[..n_begun], &self.choice);
     }
 
     /// Applies the result of alignment at a fixed step, or when the model is idle.
@@ -216,21 +230,41 @@ impl<M: Recalibrate + 'static> Aligned<M> {
     fn finish_alignment(&mut self) -> Result<(), Error> {
         let previous = AlignmentTask::done(self.alignment_task.result().cloned());
         let is_changed = self.alignment_task.finish(&self.original_keyframes)?;
-        (self.n_begun, self.due_step) = (None, None);
-        let originals = match self.timing {
-            AlignTiming::Once => std::mem::take(&mut self.original_keyframes),
-            AlignTiming::Lockstep | AlignTiming::RealTime => {
-                self.begins_at = next_live_alignment(self.original_keyframes.len());
-                self.alignment_task.request_again();
-                self.original_keyframes.clone()
+        let n_begun = self.n_begun.take();
+        self.due_step = None;
+        if self.timing != AlignTiming::Once {
+            self.begins_at = next_live_alignment(self.original_keyframes.len());
+            self.alignment_task.request_again();
+        }
+        if is_changed {
+            self.recalibrate(&previous)?;
+        }
+        if self.detects_movements && self.alignment_task.result().is_some() {
+            match (&self.movements, n_begun) {
+                (None, Some(n_begun)) => self.detect_movements(n_begun),
+                (Some((_, n_references)), _) if is_changed => {
+                    // The latest keyframes are judged again with the new corrections.
+                    let n_older = self.original_keyframes.len().saturating_sub(MOVEMENT_WINDOW);
+                    self.detect_movements(n_older.max(*n_references));
+                }
+                _ => {}
             }
-        };
-        let Some(alignment) = self.alignment_task.result().filter(|_| is_changed) else { return Ok(()) };
-        let keyframes: Vec<_> = originals
+        }
+        if self.timing == AlignTiming::Once {
+            self.original_keyframes.clear();
+        }
+        Ok(())
+    }
+
+    /// Replaces the keyframes, whose corrections have changed.
+    fn recalibrate(&mut self, previous: &AlignmentTask) -> Result<(), Error> {
+        let Some(alignment) = self.alignment_task.result() else { return Ok(()) };
+        let keyframes: Vec<_> = self
+            .original_keyframes
             .iter()
             .map(|original| CorrectedKeyframe {
                 before: previous.corrected(original),
-                after: self.alignment_task.corrected(original),
+                after: alignment.corrected(original),
             })
             .collect();
         let n_steps = self.model.n_total_steps()?;
@@ -241,6 +275,33 @@ impl<M: Recalibrate + 'static> Aligned<M> {
         }
         self.n_steps_before_restart += n_forgotten;
         Ok(())
+    }
+
+    /// Detects movements from now on: the first `n_references` keyframes are references, later ones are judged.
+    fn detect_movements(&mut self, n_references: usize) {
+        let corrected = |keyframe: &Arc<Keyframe>| self.alignment_task.corrected(keyframe);
+        let (references, later) = self.original_keyframes.split_at(n_references);
+        let mut task = MovementTask::new(references.iter().map(corrected).collect());
+        later.iter().map(corrected).for_each(|keyframe| task.push(keyframe));
+        self.movements = Some((task, n_references));
+    }
+
+    /// Applies a movement if one was found. With `wait`, judges all keyframes first. Returns whether a movement was
+    /// applied. During an alignment, no keyframes are judged.
+    fn poll_movement(&mut self, wait: bool) -> Result<bool, Error> {
+        let (Some((task, _)), None) = (&mut self.movements, self.n_begun) else { return Ok(false) };
+        let Some(movement) = task.poll(wait)? else { return Ok(false) };
+        let first = self.original_keyframes.first().map_or(Stamp(movement.since_nanos), |keyframe| keyframe.stamp);
+        let previous = AlignmentTask::done(self.alignment_task.result().cloned());
+        self.alignment_task.add_movement(movement, first);
+        if let Some(movement) = self.alignment_task.result().and_then(|alignment| alignment.movements.last()) {
+            log::warn!("{movement}");
+        }
+        self.recalibrate(&previous)?;
+        let n_keyframes = self.original_keyframes.len();
+        self.begins_at = n_keyframes; // The next alignment uses the images since the movement, too.
+        self.detect_movements(n_keyframes);
+        Ok(true)
     }
 
     /// Whether the model must wait for an alignment before its result is final.
@@ -264,11 +325,19 @@ impl<M: Recalibrate + 'static> Aligned<M> {
 
 impl<M: Recalibrate + 'static> Method for Aligned<M> {
     fn push(&mut self, keyframe: Arc<Keyframe>) -> Result<(), Error> {
-        self.model.push(self.alignment_task.corrected(&keyframe))?;
-        let is_used = !self.alignment_task.is_done() && keyframe.split != Split::Test && keyframe.is_finite();
         // Validation keyframes are pushed again after resuming.
-        if is_used && !self.original_keyframes.iter().any(|known| id_of(known) == id_of(&keyframe)) {
+        let is_new = !self.original_keyframes.iter().any(|known| id_of(known) == id_of(&keyframe));
+        if is_new && self.timing == AlignTiming::Lockstep {
+            self.poll_movement(true)?;
+        }
+        let corrected = self.alignment_task.corrected(&keyframe);
+        self.model.push(corrected.clone())?;
+        let is_used = !self.alignment_task.is_done() && keyframe.split != Split::Test && keyframe.is_finite();
+        if is_used && is_new {
             self.original_keyframes.push(keyframe);
+            if let Some((task, _)) = &mut self.movements {
+                task.push(corrected);
+            }
         }
         Ok(())
     }
@@ -277,6 +346,9 @@ impl<M: Recalibrate + 'static> Method for Aligned<M> {
         if let Some(ix) = self.original_keyframes.iter().position(|keyframe| id_of(keyframe) == (camera, stamp.0)) {
             self.original_keyframes.remove(ix);
             self.n_begun = self.n_begun.map(|n_begun| n_begun - usize::from(ix < n_begun));
+            if let Some((_, n_references)) = &mut self.movements {
+                *n_references -= usize::from(ix < *n_references);
+            }
         }
         self.model.remove(camera, stamp)
     }
@@ -286,6 +358,9 @@ impl<M: Recalibrate + 'static> Method for Aligned<M> {
         let n_steps = self.model.step(n.min(self.steps_to_alignment()))?;
         if n_steps > 0 {
             self.begin_alignment(); // After the first step, which itself needs much CPU time.
+            if let (Some((task, _)), None) = (&mut self.movements, self.n_begun) {
+                task.begin();
+            }
         }
         Ok(n_steps)
     }
@@ -295,8 +370,13 @@ impl<M: Recalibrate + 'static> Method for Aligned<M> {
     }
 
     fn poll_alignment(&mut self, wait: bool) -> Result<bool, Error> {
-        let has_begun = self.timing == AlignTiming::RealTime && self.n_begun.is_some();
-        let is_ready = has_begun && (wait || self.alignment_task.has_result());
+        if self.timing != AlignTiming::RealTime {
+            return Ok(false);
+        }
+        if self.n_begun.is_none() {
+            return self.poll_movement(wait);
+        }
+        let is_ready = wait || self.alignment_task.has_result();
         if is_ready {
             self.begin_alignment(); // A resumed model has not started it.
             self.finish_alignment()?;
@@ -348,9 +428,13 @@ impl<M: Recalibrate + 'static> Method for Aligned<M> {
         self.model.bounds()
     }
 
+    fn camera_corrections(&mut self) -> Result<BTreeMap<String, CameraCorrection>, Error> {
+        self.model.camera_corrections()
+    }
+
     fn calibrated_camera(&mut self, keyframe: &Keyframe) -> Result<CalibratedCamera, Error> {
-        let learned = self.model.learned_correction(&keyframe.camera)?;
-        Ok(self.alignment_task.calibrated_camera(keyframe, learned.as_ref()))
+        let learned = self.model.camera_corrections()?;
+        Ok(self.alignment_task.calibrated_camera(keyframe, learned.get(&*keyframe.camera)))
     }
 
     fn profile_step(&mut self) -> Result<Vec<PassTiming>, Error> {
@@ -393,6 +477,8 @@ impl<M: Recalibrate + 'static> Method for Aligned<M> {
             timing: self.timing,
             begins_at: self.begins_at,
             n_steps_before_restart: self.n_steps_before_restart,
+            detects_movements: self.detects_movements,
+            n_references: self.movements.as_ref().map(|(_, n_references)| *n_references),
             keyframes: self
                 .original_keyframes
                 .iter()
@@ -430,6 +516,8 @@ mod tests {
     use crate::tsdf::TsdfModel;
     use calibration::ParamSet;
     use calibration::scenes::{Miscalibration, capture, remaining, wrong_extrinsics};
+    use kinematics::Transform;
+    use nalgebra::Vector3;
 
     /// Step at which the alignment result is applied.
     const ALIGNMENT_STEP: u64 = 6;
@@ -578,6 +666,78 @@ mod tests {
             assert!(model.progress().step > 2 * ALIGNMENT_STEP, "no further alignment");
             assert!(!model.poll_alignment(true).unwrap());
         }
+    }
+
+    /// A model without steps before its first alignment with `n` keyframes, which detects movements.
+    fn detecting(timing: AlignTiming, n: usize) -> Aligned<MeanColor> {
+        let choice = CameraRefinement::Always(ParamSet::EXTRINSICS);
+        Aligned {
+            timing,
+            begins_at: n,
+            detects_movements: true,
+            ..Aligned::new(MeanColor::new(ModelOptions::default()), choice, true, 4 * ALIGNMENT_STEP)
+        }
+    }
+
+    #[test]
+    fn movement_of_a_camera_corrects_the_images_since_then() {
+        const N_FIRST: usize = 17;
+        const MOVED_AT: usize = 22;
+        let motion = Transform::new(Vector3::new(-0.004, 0.003, 0.004), Vector3::new(0.02, -0.025, 0.018));
+        let error = wrong_extrinsics();
+        let scan = |extrinsics: Transform| {
+            let mut keyframes = capture(&Miscalibration { extrinsics, ..Miscalibration::none() });
+            keyframes.retain(|keyframe| keyframe.split != Split::Test);
+            keyframes
+        };
+        let [before, after, right] = [error, motion.inverse() * error, Transform::identity()].map(scan);
+        let keyframes = [&before[..MOVED_AT], &after[MOVED_AT..]].concat();
+        let train_on = |model: &mut dyn Method, keyframes: &[Arc<Keyframe>]| {
+            for keyframe in keyframes {
+                model.push(keyframe.clone()).unwrap();
+                train(model, 2);
+                model.poll_alignment(true).unwrap();
+            }
+        };
+        let start = |timing: AlignTiming| {
+            let mut model = detecting(timing, N_FIRST);
+            keyframes[..N_FIRST].iter().for_each(|keyframe| model.push(keyframe.clone()).unwrap());
+            train(&mut model, ALIGNMENT_STEP + 2);
+            model.poll_alignment(true).unwrap();
+            assert!(model.alignment().unwrap().has_corrections());
+            model
+        };
+        for timing in [AlignTiming::Lockstep, AlignTiming::RealTime] {
+            let mut model = start(timing);
+            train_on(&mut model, &keyframes[N_FIRST..]);
+            train(&mut model, 3 * ALIGNMENT_STEP);
+            model.poll_alignment(true).unwrap();
+            let movements = &model.alignment().unwrap().movements;
+            assert_eq!(movements.len(), 1, "{movements:?}");
+            assert_eq!((&*movements[0].camera, movements[0].since_nanos), ("wrist", keyframes[MOVED_AT].stamp.0));
+            let text = movements[0].to_string();
+            assert!(text.contains("moved by 2.1 degrees and 6 mm"), "{text}");
+            for (ix, (keyframe, right)) in keyframes.iter().zip(&right).enumerate() {
+                let camera = model.calibrated_camera(keyframe).unwrap();
+                let left = right.world_from_camera.inverse() * camera.world_from_camera;
+                let (degrees, mm) = (left.rotation.angle().to_degrees(), 1e3 * left.translation.vector.norm());
+                assert!(degrees < 0.06 && mm < 0.8, "image {ix}: {degrees} degrees, {mm} mm");
+            }
+        }
+
+        // A resumed run finds the same movement at the same step.
+        let mut uninterrupted = start(AlignTiming::Lockstep);
+        let n_before = MOVED_AT + 2;
+        train_on(&mut uninterrupted, &keyframes[N_FIRST..n_before]);
+        let checkpoint = uninterrupted.checkpoint().unwrap().finish().unwrap();
+        let resume = |own: &Checkpoint, keyframes: &[Arc<Keyframe>]| MeanColor::resume(own, keyframes);
+        let (mut resumed, _) = Aligned::resume(&checkpoint, &keyframes[..n_before], resume).unwrap();
+        let ends = [&mut uninterrupted as &mut dyn Method, &mut *resumed].map(|model| {
+            train_on(model, &keyframes[n_before..]);
+            model.checkpoint().unwrap().finish().unwrap()
+        });
+        assert_eq!(ends[0], ends[1]);
+        assert_eq!(uninterrupted.alignment().unwrap().movements.len(), 1);
     }
 
     #[test]

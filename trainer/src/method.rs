@@ -4,9 +4,10 @@ use crate::bounds::Bounds;
 use crate::checkpoint::PendingCheckpoint;
 use crate::gpu::PassTiming;
 use crate::{Error, Packing, Picture, QueuedPicture, RenderRequest, Rendered};
-use calibration::{Alignment, CalibratedCamera, TrialReport};
+use calibration::{Alignment, CalibratedCamera, CameraCorrection, TrialReport};
 use keyframe::Keyframe;
 use kinematics::Stamp;
+use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
 
@@ -89,6 +90,11 @@ pub trait Method {
     /// A sphere that contains most of the model; `None` if the model is empty or does not support this.
     fn bounds(&mut self) -> Result<Option<Bounds>, Error> {
         Ok(None)
+    }
+    /// Corrections of cameras that were optimized with the scene, by name. They follow those of [`Method::alignment`].
+    /// Waits for queued work.
+    fn camera_corrections(&mut self) -> Result<BTreeMap<String, CameraCorrection>, Error> {
+        Ok(BTreeMap::new())
     }
     /// The camera of a keyframe with the model's per-camera corrections, but without its per-image corrections.
     fn calibrated_camera(&mut self, keyframe: &Keyframe) -> Result<CalibratedCamera, Error>;

@@ -41,6 +41,10 @@ pub struct CommonOptions {
     pub align: CameraRefinement,
     /// When they are estimated.
     pub align_timing: AlignTiming,
+    /// Whether movements of cameras relative to their mounts are detected, if cameras are aligned repeatedly. The poses
+    /// must not drift.
+    #[serde(default)]
+    pub detects_movements: bool,
 }
 
 /// Options of a model. `S` is the type of the method-specific options; the default, JSON, holds those of any method.
@@ -62,6 +66,7 @@ impl Default for CommonOptions {
             cameras: CameraRefinement::default(),
             align: CameraRefinement::default(),
             align_timing: AlignTiming::Once,
+            detects_movements: false,
         }
     }
 }

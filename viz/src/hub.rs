@@ -6,6 +6,7 @@ use crate::protocol::{PictureHeader, ProjectionMessage};
 use crate::queue::{Outgoing, Queue, RenderJob};
 use crate::updates::{KeyframePose, LiveImage, RunResult, SceneHint, Status};
 use crate::view_request::ViewRequest;
+use kinematics::Transform;
 use parking_lot::{Condvar, Mutex, MutexGuard};
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -28,6 +29,8 @@ struct Shared {
     scene: watch::Sender<Option<Arc<SceneHint>>>,
     keyframes: watch::Sender<Arc<[KeyframePose]>>,
     live_images: watch::Sender<LiveImages>,
+    /// By camera: transform from the corrected to the reported camera frame.
+    camera_corrections: Mutex<BTreeMap<Arc<str>, Transform>>,
     queue: Mutex<Queue>,
     work_arrived: Condvar,
 }
@@ -65,11 +68,21 @@ impl Hub {
     }
 
     /// Sets the latest image of a camera. It is encoded later, on another thread, and only while clients are
-    /// connected.
-    pub fn set_live_image(&self, image: LiveImage) {
+    /// connected. Its pose is corrected as set by [`Self::set_camera_corrections`].
+    pub fn set_live_image(&self, mut image: LiveImage) {
+        if let (Some(pose), Some(correction)) =
+            (&mut image.world_from_camera, self.shared.camera_corrections.lock().get(&image.camera))
+        {
+            *pose *= correction;
+        }
         self.shared.live_images.send_modify(|images| {
             images.insert(Arc::clone(&image.camera), Arc::new(image));
         });
+    }
+
+    /// Sets `reported_from_corrected` of each camera, by which the poses of later live images are corrected.
+    pub fn set_camera_corrections(&self, corrections: BTreeMap<Arc<str>, Transform>) {
+        *self.shared.camera_corrections.lock() = corrections;
     }
 
     /// Sets the scene extent and the initial view.

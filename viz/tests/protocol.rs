@@ -310,11 +310,16 @@ fn live_images_reach_every_client_once_as_jpeg() {
         let picture = image::load_from_memory_with_format(&jpeg, image::ImageFormat::Jpeg).expect("a JPEG").to_rgb8();
         assert!(picture.get_pixel(60, 20)[0].abs_diff(240) < 16, "{:?}", picture.get_pixel(60, 20));
     }
+    let corrections =
+        [("wrist", 0.5), ("other", 2.0)].map(|(name, x)| (name.into(), Transform::translation(x, 0.0, 0.0)));
+    hub.set_camera_corrections(corrections.into());
     hub.set_live_image(image(6));
     hub.set_live_image(image(7));
     for client in &mut clients {
-        let stamp = client.binary_of("live_image").0["stamp_nanos"].clone();
-        assert!(stamp == json!(6) || stamp == json!(7), "{stamp}");
+        let header = client.binary_of("live_image").0;
+        let stamp = &header["stamp_nanos"];
+        assert!(*stamp == json!(6) || *stamp == json!(7), "{stamp}");
+        assert_eq!(header["world_from_camera"][3], json!(0.5), "the pose is corrected");
     }
 }
 

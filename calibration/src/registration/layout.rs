@@ -114,6 +114,14 @@ impl Layout {
         layout
     }
 
+    /// The extrinsics of one camera.
+    pub(super) fn extrinsics_of(camera: usize) -> Self {
+        let mut by_camera = vec![CameraParamOffsets::default(); camera];
+        by_camera.push(CameraParamOffsets { extrinsics: Some(0), ..CameraParamOffsets::default() });
+        let params = (0..6).map(|part| CalibrationParam::Extrinsics(camera, part)).collect();
+        Self { params, by_camera, joints: None }
+    }
+
     pub(super) fn n(&self) -> usize {
         self.params.len()
     }

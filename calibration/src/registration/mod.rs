@@ -12,6 +12,7 @@
 mod corrections;
 mod fit;
 mod layout;
+mod movement;
 mod pairs;
 mod poses;
 mod prepared_image;
@@ -25,6 +26,7 @@ pub(crate) mod tests;
 mod validation;
 mod view;
 
+pub use movement::{CameraMovement, MOVEMENT_WINDOW, MovementDetector};
 pub use report::{Alignment, Estimate, PoseEstimate, ScalarEstimate, Unobservable};
 pub use station::{StationCorrection, register_station};
 

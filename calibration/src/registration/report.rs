@@ -1,20 +1,18 @@
 //! Results of alignment, as data and as text.
 
+use super::corrections::rotation_and_translation;
 use super::fit::Fit;
 use super::layout::CalibrationParam;
+use super::movement::CameraMovement;
 use super::solve::Solution;
 use super::{AlignmentScene, CalibrationModel};
-use crate::{CalibratedCamera, CameraCorrection, Candidate, MIN_VALIDATION_IMAGES, ParamSet, Trial};
+use crate::{CalibratedCamera, CameraCorrection, Candidate, MIN_VALIDATION_IMAGES, ParamSet, Trial, rigid_transform};
 use keyframe::Keyframe;
+use kinematics::{Stamp, Transform};
 use nalgebra::{DVector, Vector3};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
-
-/// Smaller differences between two alignments do not matter: rotation of the camera (0.03 degrees), translation, and
-/// relative change of the focal length.
-const NOTICEABLE_RAD: f64 = 5e-4;
-const NOTICEABLE_M: f64 = 5e-4;
-const NOTICEABLE_FOCAL: f64 = 1e-3;
+use std::sync::Arc;
 
 /// Result of alignment.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -30,6 +28,10 @@ pub struct Alignment {
     pub trials: Vec<Trial>,
     /// Number of compared pairs of images.
     pub n_pairs: usize,
+    /// Movements of cameras relative to their mounts, in order of detection. Their corrections are applied before
+    /// `corrections`.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub movements: Vec<CameraMovement>,
 }
 
 /// One estimated correction. Each sigma is a standard deviation.
@@ -154,7 +156,7 @@ pub(super) fn alignment(
         .zip(&kept.corrections.by_camera)
         .map(|(name, correction)| (name.to_string(), correction.clone()));
     let corrections = if kept.set.is_empty() { BTreeMap::new() } else { corrections.collect() };
-    Alignment { corrections, estimates, unobservable, trials, n_pairs: scene.pairs.len() }
+    Alignment { corrections, estimates, unobservable, trials, n_pairs: scene.pairs.len(), movements: Vec::new() }
 }
 
 /// The estimate of the group of parameters that starts with a parameter; `None` if the parameter is not the first of
@@ -172,7 +174,7 @@ fn estimate(
     Some(match param {
         CalibrationParam::Extrinsics(camera, 0) => {
             let wrong_extrinsics =
-                crate::rigid_transform(correction(camera).rotation_rad.into(), correction(camera).translation_m.into())
+                rigid_transform(correction(camera).rotation_rad.into(), correction(camera).translation_m.into())
                     .inverse();
             Estimate::HandEye(pose_estimate(
                 name(camera),
@@ -305,17 +307,57 @@ impl Alignment {
 
     /// Whether another alignment places the camera of a keyframe noticeably differently.
     pub(crate) fn differs(&self, other: &Self, keyframe: &Keyframe) -> bool {
-        let keyframe = Keyframe { rgba_srgb: [].into(), depth: None, ..keyframe.clone() };
-        let camera = |alignment: &Self| match alignment.corrections.get(&*keyframe.camera) {
-            Some(correction) => correction.apply(&keyframe),
-            None => CalibratedCamera::of(&keyframe),
-        };
-        let (here, there) = (camera(self), camera(other));
-        let motion = here.world_from_camera.inverse() * there.world_from_camera;
-        let focal_change = (0..2).map(|axis| (there.focal_px[axis] / here.focal_px[axis] - 1.0).abs());
-        motion.rotation.angle() > NOTICEABLE_RAD
-            || motion.translation.vector.norm() > NOTICEABLE_M
-            || focal_change.fold(0.0, f64::max) > NOTICEABLE_FOCAL
+        self.camera(keyframe, None).differs_noticeably(&other.camera(keyframe, None))
+    }
+
+    /// The camera of a keyframe with these corrections, followed by one that was optimized with the scene.
+    pub fn camera(&self, keyframe: &Keyframe, learned: Option<&CameraCorrection>) -> CalibratedCamera {
+        let correction = self.corrections.get(&*keyframe.camera);
+        let color_from_depth = keyframe.depth.as_ref().map(|depth| match correction {
+            Some(correction) => correction.color_from_depth(keyframe, depth),
+            None => keyframe.world_from_camera.inverse() * depth.world_from_camera,
+        });
+        let aligned = self.corrected(&Arc::new(Keyframe { depth: None, ..keyframe.clone() }));
+        let camera = learned.map_or_else(|| CalibratedCamera::of(&aligned), |correction| correction.apply(&aligned));
+        CalibratedCamera { color_from_depth, ..camera }
+    }
+
+    /// The keyframe with these corrections.
+    pub fn corrected(&self, keyframe: &Arc<Keyframe>) -> Arc<Keyframe> {
+        let keyframe = self.with_movements(keyframe);
+        match self.corrections.get(&*keyframe.camera) {
+            Some(correction) => Arc::new(correction.corrected(&keyframe)),
+            None => keyframe,
+        }
+    }
+
+    /// The keyframe with the corrections of its camera's movements only.
+    pub fn with_movements(&self, keyframe: &Arc<Keyframe>) -> Arc<Keyframe> {
+        match self.movement_correction(&keyframe.camera, keyframe.stamp) {
+            Some(correction) => Arc::new(correction.corrected(keyframe)),
+            None => keyframe.clone(),
+        }
+    }
+
+    /// Correction of a camera's movements until a stamp; `None` without movements.
+    pub fn movement_correction(&self, camera: &str, stamp: Stamp) -> Option<CameraCorrection> {
+        let movements =
+            self.movements.iter().filter(|movement| movement.camera == camera && movement.since_nanos <= stamp.0);
+        let total = movements.map(CameraMovement::correction).reduce(|before, after| after * before)?;
+        let (rotation_rad, translation_m) = rotation_and_translation(&total);
+        Some(CameraCorrection { rotation_rad, translation_m, ..CameraCorrection::default() })
+    }
+
+    /// Adds a movement of keyframes to which these corrections have been applied. `first` is the stamp of the first
+    /// keyframe.
+    pub fn add_movement(&mut self, movement: CameraMovement, first: Stamp) {
+        let extrinsics = self.corrections.get(&movement.camera).map_or(Transform::identity(), |correction| {
+            rigid_transform(correction.rotation_rad.into(), correction.translation_m.into())
+        });
+        let before_extrinsics = extrinsics.inverse() * movement.correction() * extrinsics;
+        let (rotation_rad, translation_m) = rotation_and_translation(&before_extrinsics);
+        let since_secs = (movement.since_nanos - first.0) as f64 * 1e-9;
+        self.movements.push(CameraMovement { rotation_rad, translation_m, since_secs, ..movement });
     }
 
     /// Whether there were enough validation images for decisions.

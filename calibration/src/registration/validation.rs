@@ -108,6 +108,25 @@ pub(super) fn scores(
     by_image.into_values().map(psnr).unzip()
 }
 
+/// Gain of the prediction of an image if its view is replaced, dB; `None` if too few samples are visible. All pairs must
+/// lead to this image.
+pub(super) fn gain_db(
+    images: &[PreparedImage],
+    views: &[CorrectedView],
+    pairs: &[Pair],
+    replaced: &CorrectedView,
+    noise: Noise,
+) -> Option<f64> {
+    let mut sum = PairedErrors::default();
+    for pair in pairs {
+        let [from, to] = sums::sides(images, views, *pair);
+        let sides = [[from, to], [from, Side { view: replaced, ..to }]];
+        add_errors(&mut sum, errors(sides, noise, PixelSubset::All));
+    }
+    let (baseline, variant) = psnr(sum);
+    (sum.0 > MIN_SAMPLES).then_some(variant - baseline)
+}
+
 /// Errors of a pair with baseline and variant, at the samples that both show.
 fn errors(sides: [[Side<'_>; 2]; 2], noise: Noise, part: PixelSubset) -> PairedErrors {
     let options = ResidualOptions { level: 0, occlusion_frac: OCCLUSION_FRAC, noise, part };

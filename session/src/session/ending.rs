@@ -193,6 +193,8 @@ impl Session {
             outcome: &outcome,
             comparisons,
             passes,
+            cameras: method.camera_corrections()?,
+            alignment: method.alignment(),
             trials: method.report(),
             adapter: self.gpu.describe(),
             details,

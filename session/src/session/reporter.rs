@@ -7,9 +7,10 @@ use crate::evaluate::{ImageScores, Scores};
 use crate::next_commands::{self, DataSource, SavedModel};
 use crate::observer::{DoneEvent, Evaluation, FinishedReport, Observer, ProfileEvent, SessionEvent, SessionProgress};
 use crate::{report, run_folder};
-use calibration::TrialReport;
+use calibration::{Alignment, CameraCorrection, TrialReport};
 use keyframe::Keyframe;
 use serde::Serialize;
+use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
 use trainer::{Method, ModelKind, Progress};
@@ -21,6 +22,10 @@ struct Report<'a, T: Serialize> {
     adapter: String,
     #[serde(flatten)]
     details: &'a T,
+    /// Camera corrections found by registration.
+    alignment: Option<&'a Alignment>,
+    /// Camera corrections optimized with the scene, without those of single images.
+    cameras: BTreeMap<String, CameraCorrection>,
     /// Results of A/B trials.
     trials: Vec<TrialReport>,
     /// GPU time of each pass of a step in milliseconds, if profiling was requested.
@@ -47,6 +52,9 @@ pub(super) struct ScoredModel<'a, T: Serialize> {
     pub comparisons: crate::Result<Vec<report::Comparison>>,
     /// GPU time of each kernel in a step in milliseconds, if profiling was requested.
     pub passes: Option<Vec<(&'static str, f64)>>,
+    pub alignment: Option<&'a Alignment>,
+    /// Camera corrections optimized with the scene.
+    pub cameras: BTreeMap<String, CameraCorrection>,
     /// Results of A/B trials.
     pub trials: Vec<TrialReport>,
     /// The GPU adapter and its driver.
@@ -170,6 +178,8 @@ impl Reporter {
             done: &done,
             adapter: model.adapter,
             details: model.details,
+            alignment: model.alignment,
+            cameras: model.cameras.into_iter().map(|(name, camera)| (name, camera.of_all_images())).collect(),
             trials: model.trials,
             passes: model.passes.unwrap_or_default(),
             evaluations: &outcome.evaluations,

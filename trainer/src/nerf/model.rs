@@ -100,7 +100,7 @@ impl NerfModel {
     }
 
     /// Correction of each camera; empty if none are optimized or loaded.
-    fn camera_corrections(&mut self) -> Result<&BTreeMap<String, CameraCorrection>, Error> {
+    fn current_corrections(&mut self) -> Result<&BTreeMap<String, CameraCorrection>, Error> {
         if self.corrections.is_none() {
             self.finish_in_flight()?;
             self.corrections = Some(self.learned_corrections()?);
@@ -262,10 +262,6 @@ impl Recalibrate for NerfModel {
         self.set_watched(is_watched);
         keyframes.iter().try_for_each(|keyframe| self.push(keyframe.after.clone()))
     }
-
-    fn learned_correction(&mut self, camera: &str) -> Result<Option<CameraCorrection>, Error> {
-        Ok(self.camera_corrections()?.get(camera).cloned())
-    }
 }
 
 impl Method for NerfModel {
@@ -368,8 +364,12 @@ impl Method for NerfModel {
         Ok(self.extent().map(|extent| Bounds { center_m: extent.center_m, radius_m: extent.radius_m }))
     }
 
+    fn camera_corrections(&mut self) -> Result<BTreeMap<String, CameraCorrection>, Error> {
+        Ok(self.current_corrections()?.clone())
+    }
+
     fn calibrated_camera(&mut self, keyframe: &Keyframe) -> Result<CalibratedCamera, Error> {
-        let corrections = self.camera_corrections()?;
+        let corrections = self.current_corrections()?;
         let correction = corrections.get(keyframe.camera.as_ref());
         Ok(correction.map_or_else(|| CalibratedCamera::of(keyframe), |correction| correction.apply(keyframe)))
     }

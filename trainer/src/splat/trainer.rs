@@ -143,18 +143,6 @@ impl SplatTrainer {
         &self.trials.finished
     }
 
-    /// Estimated corrections of each camera, or the loaded ones if none are estimated.
-    pub fn camera_corrections(&mut self) -> Result<BTreeMap<String, CameraCorrection>, Error> {
-        self.finish_in_flight()?;
-        let cameras = &self.model.cameras;
-        let displayed = self.displayed_state().map(|snapshot| &snapshot.cameras);
-        let (set, params) = displayed.map_or((cameras.set, &cameras.params), |(set, params)| (*set, params));
-        if set.is_empty() {
-            return Ok(self.saved_corrections.clone());
-        }
-        cameras.corrections(&self.recorder.gpu, set, params, self.seeding.scene.size_m)
-    }
-
     fn learn(&mut self) -> Result<Arc<TrainPipelines>, Error> {
         self.optimizer.pipelines.wait(&self.recorder.gpu)
     }
@@ -329,6 +317,18 @@ impl Method for SplatTrainer {
 
     fn bounds(&mut self) -> Result<Option<Bounds>, Error> {
         Ok(bounds(&self.arrays()?))
+    }
+
+    /// The estimated corrections, or the loaded ones if none are estimated.
+    fn camera_corrections(&mut self) -> Result<BTreeMap<String, CameraCorrection>, Error> {
+        self.finish_in_flight()?;
+        let cameras = &self.model.cameras;
+        let displayed = self.displayed_state().map(|snapshot| &snapshot.cameras);
+        let (set, params) = displayed.map_or((cameras.set, &cameras.params), |(set, params)| (*set, params));
+        if set.is_empty() {
+            return Ok(self.saved_corrections.clone());
+        }
+        cameras.corrections(&self.recorder.gpu, set, params, self.seeding.scene.size_m)
     }
 
     fn calibrated_camera(&mut self, keyframe: &Keyframe) -> Result<CalibratedCamera, Error> {

@@ -236,7 +236,7 @@ impl NerfModel {
             .as_ref()
             .map_or(Vec::new(), |(_, field_trainer)| begin_read(&self.gpu, field_trainer.render_buffers()));
         let (state, arrays) = (to_json(&self.state()?)?, finish(&self.gpu, reads)?);
-        let cameras = self.camera_corrections()?.clone();
+        let cameras = self.camera_corrections()?;
         Checkpoint::new(METHOD, state, arrays).write(&folder.join(FIELD_FILE))?;
         let sizes = self.field.as_ref().map(|(_, field_trainer)| &field_trainer.sizes);
         let description = serde_json::json!({

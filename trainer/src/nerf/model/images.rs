@@ -306,7 +306,7 @@ impl NerfModel {
     /// Appearance embedding for a camera and stamp, interpolated between the images before and after it. Falls back to
     /// the mean of all embeddings.
     pub(super) fn embedding_of(&mut self, image: Option<&(Arc<str>, Stamp)>) -> Result<[f64; EMBEDDING_DIM], Error> {
-        let corrections = self.camera_corrections()?;
+        let corrections = self.current_corrections()?;
         let embedding_of_image = image
             .and_then(|(camera, stamp)| interpolate(&corrections.get(camera.as_ref())?.appearance_embeddings, *stamp));
         let all = || corrections.values().flat_map(|correction| correction.appearance_embeddings.values());

@@ -8,7 +8,7 @@ use super::SplatTrainer;
 use crate::gpu::{Gpu, f32s_of};
 use crate::splat::buffers::SplatBuffers;
 use crate::splat::camera_params::CameraParams;
-use crate::{CorrectedKeyframe, Error, Recalibrate};
+use crate::{CorrectedKeyframe, Error, Method, Recalibrate};
 use calibration::{Alignment, CameraCorrection, ParamSet};
 use keyframe::{DepthMap, Keyframe};
 use kinematics::{Intrinsics, Lens, Transform};
@@ -57,10 +57,6 @@ impl Recalibrate for SplatTrainer {
         self.model.cameras = CameraParams::new(&gpu, self.options.common.cameras.always() | params)?;
         self.schedule.extend_for_arrival();
         Ok(())
-    }
-
-    fn learned_correction(&mut self, camera: &str) -> Result<Option<CameraCorrection>, Error> {
-        Ok(self.camera_corrections()?.remove(camera))
     }
 }
 
@@ -200,7 +196,6 @@ fn move_splats(gpu: &Gpu, splats: &SplatBuffers, motions: &[Motion]) -> Result<(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::Method;
     use crate::gpu::GpuOptions;
     use crate::model_options::ModelOptions;
     use crate::splat::SplatOptions;
