@@ -113,6 +113,8 @@ pub enum Decision {
     Begin(True),
     /// The result of an alignment in the background was applied.
     Align(True),
+    /// A search for the model size was ended, because too little training time was left.
+    EndSizeSearch(True),
     /// A checkpoint was taken at this step.
     Checkpoint(True),
     /// Training ended.
@@ -275,6 +277,12 @@ impl DecisionLog {
     pub fn aligned(&mut self, step: u64) {
         self.log_activity(step);
         self.write(Line::Entry(Entry { step, decision: Decision::Align(True) }));
+    }
+
+    /// Logs that a search for the model size was ended after this many steps.
+    pub fn size_search_ended(&mut self, step: u64) {
+        self.log_activity(step);
+        self.write(Line::Entry(Entry { step, decision: Decision::EndSizeSearch(True) }));
     }
 
     /// Records that a picture was drawn.

@@ -147,6 +147,7 @@ impl Replay {
                 Decision::Remove(removed) => session.remove(&removed.camera, Stamp(removed.stamp_nanos))?,
                 Decision::Seed(_) => session.seed()?,
                 Decision::Align(_) => drop(session.poll_alignment(true)?),
+                Decision::EndSizeSearch(_) => session.end_size_search()?,
                 Decision::Begin(_) => drop(session.step(0)?),
                 Decision::Restored(_) | Decision::Checkpoint(_) | Decision::End(_) => {}
             }

@@ -64,6 +64,14 @@ impl Persistence {
         Ok(())
     }
 
+    /// Logs that a search for the model size was ended.
+    pub(super) fn log_size_search_end(&mut self, method: &mut dyn Method) -> crate::Result<()> {
+        if let Some(decisions) = &mut self.decisions {
+            decisions.size_search_ended(method.n_total_steps()?);
+        }
+        Ok(())
+    }
+
     /// Logs that a picture is drawn. Drawing affects the result, because it creates splats for new keyframes.
     pub(super) fn log_render(&mut self) {
         if let Some(decisions) = &mut self.decisions {

@@ -107,6 +107,33 @@ pub(crate) struct HeldOutScore {
     pub(crate) depth_rmse_m: Option<f64>,
 }
 
+/// Number of folds for a number of images.
+pub(crate) fn n_folds(n_images: usize) -> usize {
+    n_images.min(MAX_FOLDS)
+}
+
+/// Number of steps of the first round of a search that starts at `step`: see [`FoldModels::n_steps`].
+pub(crate) fn n_steps_of_first_round(step: u64, n_folds: usize) -> u64 {
+    n_folds as u64 * (step.min(MAX_WARM_UP) + 2 * COMPARED_STEPS)
+}
+
+impl FoldModels {
+    /// Number of steps that are left until the end of this round, and of all steps up to then.
+    pub(crate) fn n_steps(&self, step: u64) -> (u64, u64) {
+        let warm_up = self.main.schedule.step.min(MAX_WARM_UP);
+        let n_folds = self.folds.len() as u64;
+        let of_fold = 2 * COMPARED_STEPS + if self.trials.is_empty() { warm_up } else { 0 };
+        let after_phase = match self.phase {
+            FoldPhase::WarmUp => 2 * COMPARED_STEPS,
+            FoldPhase::Baseline => COMPARED_STEPS,
+            FoldPhase::Variant => 0,
+        };
+        let n_later_folds = n_folds - 1 - self.fold_ix as u64;
+        let n_left = self.until.saturating_sub(step) + after_phase + n_later_folds * of_fold;
+        (n_left, n_folds * (warm_up + (self.trials.len() as u64 + 1) * 2 * COMPARED_STEPS))
+    }
+}
+
 impl GrowthSearch {
     pub(crate) fn new(is_tested: bool) -> Self {
         if is_tested { Self::Waiting { not_before: 0 } } else { Self::Off }
@@ -195,7 +222,7 @@ impl GrowthSearch {
 /// Divides images into folds. Consecutive images are in different folds, because an image is predicted from its
 /// neighbors.
 pub(crate) fn folds(images: Vec<ImageId>) -> Vec<Vec<ImageId>> {
-    let n_folds = images.len().min(MAX_FOLDS);
+    let n_folds = n_folds(images.len());
     let mut folds = vec![Vec::new(); n_folds];
     for (ix, image) in images.into_iter().enumerate() {
         folds[ix % n_folds].push(image);

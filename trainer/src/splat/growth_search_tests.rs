@@ -1,7 +1,7 @@
 //! Tests of the growth search: few images limit the number of splats, many images do not, and interruptions of a search
 //! have no effect.
 
-use super::growth_search::{FEW_IMAGES, SEARCH_PAUSE, SEARCH_START};
+use super::growth_search::{COMPARED_STEPS, FEW_IMAGES, SEARCH_PAUSE, SEARCH_START};
 use super::training_tests::{n_keyframes, noisy, options, train};
 use super::trials::CountPolicy;
 use super::{SplatOptions, SplatTrainer};
@@ -76,12 +76,50 @@ fn useful_growth_continues() {
     let options = tested().with(|options| options.specific.seeds_per_image = Some(60.0));
     let mut trainer = new_trainer(&gpu, options, &keyframes);
     train(&mut trainer, SEARCH_START);
-    let n_before = trainer.progress().primitives;
+    let n_before = trainer.arrays().unwrap().n_splats();
     assert!(n_before < 3000, "{n_before}");
-    train(&mut trainer, 300);
+    while trainer.n_finished_rounds() == Some(0) || !trainer.is_growth_search_running() {
+        trainer.step(50).unwrap();
+    }
+    let n_both_rounds: u64 = 3 * (SEARCH_START + 2 * 2 * COMPARED_STEPS);
+    let n_needed = trainer.n_steps_for_size_search();
+    assert!((n_both_rounds..=n_both_rounds + 3 * 2 * COMPARED_STEPS).contains(&n_needed), "{n_needed}");
+    // A search that ends early keeps the accepted doubling.
+    assert!(trainer.end_size_search().unwrap() && trainer.n_steps_for_size_search() == 0);
     let reported = doublings(&trainer);
-    assert!(reported[0].kept && reported[0].gain_db > 0.1, "{reported:?}");
-    assert!(trainer.progress().primitives > n_before, "{:?}", trainer.progress());
+    assert!(reported.len() == 1 && reported[0].kept && reported[0].gain_db > 0.1, "{reported:?}");
+    assert_eq!(trainer.growth_limit().map(|n| n as usize), Some(2 * n_before));
+    train(&mut trainer, 300);
+    assert!(trainer.arrays().unwrap().n_splats() > n_before, "{:?}", trainer.progress());
+}
+
+/// A search that ends early leaves the model as if the search had not started.
+#[test]
+fn search_without_enough_time_ends_at_the_current_number() {
+    const N_FOLDS: u64 = 3;
+    const N_SEARCH: u64 = N_FOLDS * (SEARCH_START + 2 * COMPARED_STEPS);
+    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let keyframes = without_validation(n_keyframes(&gpu, 9, true));
+    let run = |n_searched: u64| {
+        let mut trainer = new_trainer(&gpu, tested(), &keyframes);
+        assert!(!trainer.end_size_search().unwrap(), "no search is due");
+        train(&mut trainer, SEARCH_START);
+        let n_splats = trainer.arrays().unwrap().n_splats();
+        assert_eq!(trainer.n_steps_for_size_search(), 2 * N_SEARCH);
+        while trainer.n_total_steps().unwrap() < SEARCH_START + n_searched {
+            let n_left = SEARCH_START + n_searched - trainer.n_total_steps().unwrap();
+            trainer.step(n_left).unwrap();
+        }
+        assert_eq!(trainer.n_steps_for_size_search(), 2 * N_SEARCH - n_searched);
+        assert!(trainer.end_size_search().unwrap() && !trainer.is_growth_search_running());
+        assert_eq!(trainer.n_total_steps().unwrap(), SEARCH_START + n_searched);
+        train(&mut trainer, 250);
+        assert!(trainer.trials().is_empty());
+        let arrays = trainer.arrays().unwrap();
+        assert_eq!(arrays.n_splats(), n_splats);
+        arrays
+    };
+    assert!(run(0) == run(SEARCH_START + COMPARED_STEPS + 30));
 }
 
 #[test]

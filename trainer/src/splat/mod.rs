@@ -14,6 +14,9 @@ mod change_against_twin;
 #[cfg(test)]
 mod checkpoint_tests;
 pub mod cloud;
+mod doubling;
+#[cfg(test)]
+mod doubling_tests;
 mod entry;
 mod few_images;
 mod file;

@@ -226,6 +226,7 @@ impl Method for SplatTrainer {
             return Ok(());
         }
         self.abort_growth_search()?; // It is repeated with this keyframe.
+        self.trials.add_image();
         if keyframe.split == Split::Validation && self.trials.holds_validation() {
             self.trials.validation.push(ValidationImage { keyframe, image: None });
             self.update_growth_search();
@@ -339,6 +340,14 @@ impl Method for SplatTrainer {
 
     fn alignment(&self) -> Option<&Alignment> {
         None
+    }
+
+    fn n_steps_for_size_search(&self) -> u64 {
+        self.n_steps_for_growth_search()
+    }
+
+    fn end_size_search(&mut self) -> Result<bool, Error> {
+        self.end_growth_search()
     }
 
     fn progress(&self) -> Progress {

@@ -9,6 +9,7 @@
 //! training keyframes.
 
 use super::buffers::SplatBuffers;
+use super::doubling::{DOUBLING_START, DOUBLING_STEPS, Doubling};
 use super::snapshot::Snapshot;
 use crate::Error;
 use crate::gpu::{Buffer, Gpu};
@@ -26,7 +27,7 @@ const SHARED_STEPS: u64 = 250;
 /// Steps per image in each half of a trial of per-image parameters, up to [`MAX_STEPS`] in total.
 const STEPS_PER_IMAGE: u64 = 4;
 const MAX_STEPS: u64 = 1200;
-/// Maximum total loss of all accepted reductions, dB.
+/// Maximum total loss of the reductions accepted since the last doubling, dB.
 const MAX_TOTAL_LOSS_DB: f64 = 0.15;
 /// Maximum number of validation keyframes that are scored.
 pub(crate) const MAX_SCORED: usize = 24;
@@ -45,6 +46,9 @@ pub enum CountPolicy {
     /// Grows up to the limit, or less if there are few images. Then halves the number repeatedly while this costs less
     /// than 0.1 dB on validation images.
     Tested,
+    /// Doubles the number as long as this gains more than 0.1 dB on validation images, then halves it like
+    /// [`Self::Tested`]. Restarts when many images are new.
+    TestedGrowth,
 }
 
 /// A validation keyframe, and its image on the GPU after the first comparison.
@@ -92,7 +96,7 @@ pub(crate) struct Arrival {
 pub(crate) enum CountState {
     /// Grows up to the limit without trials.
     ToCap,
-    /// Grows; trials start once growth has ended.
+    /// Grows. Trials that halve the number start once growth has ended.
     Growing,
     /// Trials halve the number until one of them is rejected.
     Halving,
@@ -105,6 +109,8 @@ pub(crate) enum CountState {
 pub(crate) struct SplatTrials {
     candidates: VecDeque<ParamSet>,
     count: CountState,
+    /// Present if growth depends on trials.
+    doubling: Option<Doubling>,
     /// SH degree to try next, once the number of splats is final.
     degree: u32,
     pub(crate) validation: Vec<ValidationImage>,
@@ -167,6 +173,8 @@ pub(crate) struct RemainingTrials {
     is_finished: bool,
     params: Vec<ParamSet>,
     count: CountState,
+    #[serde(default)]
+    doubling: Option<Doubling>,
     degree: u32,
 }
 
@@ -193,6 +201,9 @@ pub(crate) enum Due {
 pub(crate) struct TrialContext {
     pub(crate) step: u64,
     pub(crate) n_splats: u32,
+    /// Maximum number of splats.
+    pub(crate) max_splats: u32,
+    pub(crate) n_planned_steps: u64,
     /// Whether growth has ended. Before that, a small model may score as well as a large one only because it converges
     /// faster.
     pub(crate) is_mature: bool,
@@ -223,16 +234,18 @@ impl RunningTrial {
 
 impl SplatTrials {
     pub(crate) fn new(cameras: &CameraRefinement, count: CountPolicy) -> Self {
+        let doubling = (count == CountPolicy::TestedGrowth).then(Doubling::default);
         let candidates: VecDeque<ParamSet> = cameras.candidates().iter().copied().collect();
         let count = match count {
             CountPolicy::ToCap => CountState::ToCap,
-            CountPolicy::Tested => CountState::Growing,
+            CountPolicy::Tested | CountPolicy::TestedGrowth => CountState::Growing,
         };
         let is_finished = candidates.is_empty() && count == CountState::ToCap;
         let trial_phase = if is_finished { SplatTrialPhase::Finished } else { SplatTrialPhase::Waiting };
         Self {
             candidates,
             count,
+            doubling,
             degree: 0,
             validation: Vec::new(),
             finished: Vec::new(),
@@ -246,8 +259,11 @@ impl SplatTrials {
         !matches!(self.trial_phase, SplatTrialPhase::Finished)
     }
 
-    /// Whether splats may be added.
-    pub(crate) fn may_grow(&self) -> bool {
+    /// Whether regular densification may add splats at this step.
+    pub(crate) fn may_grow(&self, step: u64) -> bool {
+        if self.doubling.is_some() && step >= DOUBLING_START {
+            return false;
+        }
         let is_halving = matches!(self.running_trial(), Some(RunningTrial { candidate: Candidate::Halved { .. }, .. }));
         matches!(self.count, CountState::ToCap | CountState::Growing) && !is_halving
     }
@@ -271,12 +287,19 @@ impl SplatTrials {
         }
         if self.validation.len() < MIN_VALIDATION_IMAGES {
             // Wait for more images, but not indefinitely.
-            return if context.step < 2 * TRIAL_START { Due::Nothing } else { Due::ReleaseValidation };
+            let waits = context.step < 2 * TRIAL_START || (self.doubling.is_some() && !context.is_mature);
+            return if waits { Due::Nothing } else { Due::ReleaseValidation };
         }
         if let Some(params) = self.candidates.front() {
             return if *params == GAINS { Due::Gains } else { Due::Begin(Candidate::Cameras(*params)) };
         }
         let halved = Candidate::Halved { from: context.n_splats, to: context.n_splats.div_ceil(2) };
+        let doubled = Candidate::Doubled {
+            from: context.n_splats,
+            to: context.n_splats.saturating_mul(2).min(context.max_splats),
+        };
+        let is_doubling_due = context.n_splats < context.max_splats
+            && self.doubling.is_some_and(|doubling| doubling.is_due(context.step, context.n_planned_steps));
         let lower = Candidate::ShDegree { from: context.sh_degree, to: self.degree };
         match self.count {
             CountState::ToCap => Due::ReleaseValidation,
@@ -284,6 +307,7 @@ impl SplatTrials {
             CountState::Finished => Due::ReleaseValidation,
             CountState::Halving => Due::Begin(halved),
             CountState::Growing if context.is_mature => Due::Begin(halved),
+            CountState::Growing if is_doubling_due => Due::Begin(doubled),
             CountState::Growing => Due::Nothing,
         }
     }
@@ -306,6 +330,20 @@ impl SplatTrials {
             false => trial.arrivals.push_back(Arrival { step, keyframe: keyframe.clone() }),
         }
         is_deferred
+    }
+
+    /// Counts an image that arrives.
+    pub(crate) fn add_image(&mut self) {
+        self.doubling.iter_mut().for_each(Doubling::add_image);
+    }
+
+    /// If growth depends on trials and many of the `n_images` images are new, restarts the search for the number of
+    /// splats, and excludes validation keyframes that arrive from now on from training. Has no effect during a trial.
+    pub(crate) fn restart_growth(&mut self, n_images: usize) {
+        if self.running_trial().is_none() && self.doubling.as_mut().is_some_and(|doubling| doubling.restart(n_images)) {
+            self.count = CountState::Growing;
+            self.trial_phase = SplatTrialPhase::Waiting;
+        }
     }
 
     /// Next keyframe to add in the second half of a trial.
@@ -334,8 +372,12 @@ impl SplatTrials {
             Candidate::Cameras(params) if params.intersects(ParamSet::IMAGE_POSES | ParamSet::IMAGE_GAINS) => {
                 (STEPS_PER_IMAGE * n_views as u64).clamp(SHARED_STEPS, MAX_STEPS)
             }
+            Candidate::Doubled { .. } => DOUBLING_STEPS,
             _ => SHARED_STEPS,
         };
+        if matches!(candidate, Candidate::Doubled { .. }) {
+            self.doubling.iter_mut().for_each(Doubling::begin);
+        }
         let until = from.schedule.step + n_steps;
         let scored = self.scored();
         self.trial_phase = SplatTrialPhase::Running(RunningTrial {
@@ -362,12 +404,13 @@ impl SplatTrials {
 
     /// Accepts or rejects the change.
     pub(crate) fn end(&mut self, variant_db: &Scores) -> Option<TrialEnd> {
-        let RunningTrial { candidate, other, baseline_db, deferred, .. } = self.take_second_half()?;
+        let RunningTrial { candidate, until, other, baseline_db, deferred, .. } = self.take_second_half()?;
         let (baseline_db, variant_db) = pair_scores(&baseline_db?, variant_db);
         let kept = self.evaluate(candidate, &baseline_db, &variant_db);
         match candidate {
             Candidate::Cameras(_) => drop(self.candidates.pop_front()),
-            Candidate::Doubled { .. } => {} // Tested by the growth search.
+            Candidate::Doubled { .. } if kept => {}
+            Candidate::Doubled { .. } => self.doubling.iter_mut().for_each(|doubling| doubling.reject(until)),
             Candidate::Halved { to, .. } if kept && to > MIN_SPLATS => self.count = CountState::Halving,
             Candidate::Halved { .. } => self.count = CountState::Finished,
             Candidate::ShDegree { from, to } => self.degree = if kept { from } else { to + 1 },
@@ -384,7 +427,9 @@ impl SplatTrials {
     fn evaluate(&mut self, candidate: Candidate, baseline_db: &[f64], variant_db: &[f64]) -> bool {
         log::debug!("{candidate}: PSNR without the change {baseline_db:.3?} dB, with it {variant_db:.3?} dB");
         let mut trial = Trial::of(candidate, baseline_db, variant_db);
-        let reductions = self.finished.iter().filter(|finished| finished.kept && finished.candidate.reduces_model());
+        let is_growth = |trial: &&Trial| trial.kept && matches!(trial.candidate, Candidate::Doubled { .. });
+        let since_growth = self.finished.iter().rev().take_while(|trial| !is_growth(trial));
+        let reductions = since_growth.filter(|finished| finished.kept && finished.candidate.reduces_model());
         let total_loss_db: f64 = reductions.map(|finished| (-finished.gain_db).max(0.0)).sum();
         trial.kept &= !candidate.reduces_model() || total_loss_db - trial.gain_db <= MAX_TOTAL_LOSS_DB;
         trial.log_result();
@@ -442,6 +487,7 @@ impl SplatTrials {
             is_finished: !self.holds_validation(),
             params: self.candidates.iter().copied().collect(),
             count: self.count,
+            doubling: self.doubling,
             degree: self.degree,
         }
     }
@@ -451,7 +497,8 @@ impl SplatTrials {
         self.trial_phase =
             if remaining_trials.is_finished { SplatTrialPhase::Finished } else { SplatTrialPhase::Waiting };
         self.candidates = remaining_trials.params.into();
-        (self.count, self.degree, self.finished) = (remaining_trials.count, remaining_trials.degree, finished);
+        (self.count, self.doubling) = (remaining_trials.count, remaining_trials.doubling);
+        (self.degree, self.finished) = (remaining_trials.degree, finished);
     }
 
     /// Restores a trial from a checkpoint.
@@ -481,6 +528,14 @@ mod tests {
     use super::*;
 
     const HALVED: Candidate = Candidate::Halved { from: 20_000, to: 10_000 };
+    const CONTEXT: TrialContext = TrialContext {
+        step: 0,
+        n_splats: 5000,
+        max_splats: 20_000,
+        n_planned_steps: 7000,
+        is_mature: false,
+        sh_degree: 3,
+    };
 
     fn poses() -> ParamSet {
         ParamSet::IMAGE_POSES
@@ -514,11 +569,8 @@ mod tests {
     #[test]
     fn no_trials_without_candidates() {
         let trials = SplatTrials::new(&CameraRefinement::default(), CountPolicy::ToCap);
-        assert!(!trials.holds_validation() && trials.may_grow());
-        assert_eq!(
-            trials.due(TrialContext { step: 10_000, n_splats: 5000, is_mature: true, sh_degree: 3 }),
-            Due::Nothing
-        );
+        assert!(!trials.holds_validation() && trials.may_grow(0));
+        assert_eq!(trials.due(TrialContext { step: 10_000, is_mature: true, ..CONTEXT }), Due::Nothing);
     }
 
     #[test]
@@ -526,7 +578,7 @@ mod tests {
         for count in [CountPolicy::ToCap, CountPolicy::Tested] {
             let trials = SplatTrials::new(&CameraRefinement::Try(vec![poses()]), count);
             assert!(trials.holds_validation());
-            let due = |step| trials.due(TrialContext { step, n_splats: 5000, is_mature: false, sh_degree: 3 });
+            let due = |step| trials.due(TrialContext { step, ..CONTEXT });
             assert_eq!(due(TRIAL_START), Due::Nothing);
             assert_eq!(due(2 * TRIAL_START), Due::ReleaseValidation);
         }

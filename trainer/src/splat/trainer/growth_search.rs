@@ -3,14 +3,13 @@
 use super::SplatTrainer;
 use super::renderer::DrawnView;
 use super::scoring::corrected_camera;
-use super::training::growth_key;
 use super::{products, view_set};
 use crate::eval::depth_rmse_m;
 use crate::packing::Output;
 use crate::splat::buffers::SplatBuffers;
 use crate::splat::growth_search::{
     COMPARED_STEPS, FEW_IMAGES, FoldModels, FoldPhase, GrowthLimit, GrowthSearch, HeldOutScore, MAX_WARM_UP,
-    SEARCH_START, doubling_trial, folds,
+    SEARCH_START, doubling_trial, folds, n_folds, n_steps_of_first_round,
 };
 use crate::splat::schedule::Schedule;
 use crate::splat::snapshot::{ObservedScene, Snapshot};
@@ -25,6 +24,7 @@ impl SplatTrainer {
     /// Adapts the search to a change of the images, unless a trial is running, whose halves must be trained alike.
     pub(super) fn update_growth_search(&mut self) {
         if self.trials.running_trial().is_none() {
+            self.trials.restart_growth(self.n_images());
             self.growth_search.postpone(self.schedule.step);
             self.growth_search.set_n_images(self.n_images());
         }
@@ -75,6 +75,36 @@ impl SplatTrainer {
             }
             other => other,
         }
+    }
+
+    /// See [`Method::n_steps_for_size_search`].
+    pub(super) fn n_steps_for_growth_search(&self) -> u64 {
+        let step = self.schedule.step;
+        match self.growth_search.running() {
+            Some(models) => {
+                let (n_left, n_total) = models.n_steps(step);
+                n_left + n_total
+            }
+            None if self.is_growth_search_due() => 2 * n_steps_of_first_round(step, n_folds(self.n_images())),
+            None => 0,
+        }
+    }
+
+    /// Ends a search that is due or running. Growth ends at the last accepted number of splats, or at the current one.
+    pub(super) fn end_growth_search(&mut self) -> Result<bool, Error> {
+        self.finish_in_flight()?; // A failed submit may reduce the step count.
+        let n_splats = if let Some(models) = self.growth_search.running_mut() {
+            self.trials.finished.append(&mut models.trials);
+            models.n_splats
+        } else if self.is_growth_search_due() {
+            self.model.splats.n_splats
+        } else {
+            return Ok(false);
+        };
+        log::info!("too little training time is left to test the number of splats; it is limited to {n_splats}");
+        self.abort_growth_search()?;
+        self.growth_search = GrowthSearch::Finished(GrowthLimit { n_splats, n_images: self.n_images() });
+        Ok(true)
     }
 
     /// Restores the model that is trained on all images, if a search is running. The search is repeated.
@@ -156,16 +186,7 @@ impl SplatTrainer {
         if let Some(fork) = models.fork.take() {
             self.restore_snapshot(fork)?;
         }
-        let learn = self.learn()?;
-        let (n_more, step) = (self.model.splats.n_splats, self.schedule.step);
-        self.schedule.last_growth_step = step;
-        let key = growth_key(self.options.common.seed, step);
-        self.model.grow(&mut self.recorder, &mut self.renderer, &learn, n_more, key)?;
-        let n_splats = self.model.splats.n_splats;
-        if n_splats < n_more.saturating_mul(2).min(self.options.cap()) {
-            return Err(Error::OutOfMemory { label: "splat.doubled".to_owned(), bytes: 0 });
-        }
-        Ok(())
+        self.grow_to(self.model.splats.n_splats.saturating_mul(2).min(self.options.cap()))
     }
 
     /// Scores the model with twice the number of splats. Continues with the next fold, or decides.
@@ -268,6 +289,11 @@ impl SplatTrainer {
     #[cfg(test)]
     pub(in crate::splat) fn n_active_views(&self) -> usize {
         self.views.n_active()
+    }
+
+    #[cfg(test)]
+    pub(in crate::splat) fn n_finished_rounds(&self) -> Option<usize> {
+        self.growth_search.running().map(|models| models.trials.len())
     }
 
     #[cfg(test)]

@@ -14,6 +14,8 @@ impl SplatTrainer {
         TrialContext {
             step: self.schedule.step,
             n_splats: self.model.splats.n_splats,
+            max_splats: if self.model.is_full() { self.model.splats.n_splats } else { self.options.cap() },
+            n_planned_steps: self.options.common.n_planned_steps,
             is_mature: self.schedule.is_mature(),
             sh_degree: self.model.splats.sh_degree,
         }
@@ -72,10 +74,22 @@ impl SplatTrainer {
         match candidate {
             Candidate::Cameras(params) => self.model.cameras.enable(params),
             Candidate::Halved { to, .. } => self.keep_most_contributing(to)?,
-            Candidate::Doubled { .. } => {} // Tested by the growth search.
+            Candidate::Doubled { to, .. } => return self.double_for_trial(to),
             Candidate::ShDegree { to, .. } => self.lower_degree(to)?,
         }
         self.prepare_training()
+    }
+
+    /// Doubles the number of splats in the second half of a trial.
+    fn double_for_trial(&mut self, n_splats: u32) -> Result<(), Error> {
+        match self.grow_to(n_splats) {
+            Err(error) if error.is_out_of_memory() => {
+                let canceled = self.trials.cancel();
+                canceled.map_or(Ok(()), |canceled| self.end_trial(canceled))?;
+                self.end_trials_without_memory(error)
+            }
+            grown => grown.and_then(|()| self.prepare_training()),
+        }
     }
 
     /// Adds a keyframe in the second half, at the same step at which it arrived in the first half.

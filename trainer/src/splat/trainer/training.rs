@@ -83,11 +83,30 @@ impl SplatTrainer {
         self.model.grow(&mut self.recorder, &mut self.renderer, learn, n_new, key)
     }
 
+    /// Changes the splat count to `n_splats` outside of the schedule.
+    ///
+    /// # Errors
+    ///
+    /// [`Error::OutOfMemory`] if GPU memory is insufficient.
+    pub(super) fn grow_to(&mut self, n_splats: u32) -> Result<(), Error> {
+        let learn = self.learn()?;
+        let (n_more, step) = (n_splats.saturating_sub(self.model.splats.n_splats), self.schedule.step);
+        self.schedule.last_growth_step = step;
+        let key = growth_key(self.options.common.seed, step);
+        let is_full = self.model.is_full();
+        self.model.grow(&mut self.recorder, &mut self.renderer, &learn, n_more, key)?;
+        if self.model.splats.n_splats < n_splats {
+            self.model.set_full(is_full); // There may be enough memory once the copies of the model are freed.
+            return Err(Error::OutOfMemory { label: "splat.doubled".to_owned(), bytes: 0 });
+        }
+        Ok(())
+    }
+
     /// Number of splats to add at a change of the splat count.
     #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "saturates, then limited")]
     fn n_new_splats(&self) -> u32 {
         let n_splats = self.model.splats.n_splats;
-        if !self.trials.may_grow() || !self.growth_search.may_grow() {
+        if !self.trials.may_grow(self.schedule.step) || !self.growth_search.may_grow() {
             return 0;
         }
         let n_new = (f64::from(n_splats) * self.options.specific.growth_frac).ceil() as u32;

@@ -1,0 +1,109 @@
+//! When trials double the number of splats of a model whose images arrive during training.
+//!
+//! The trials run while the model grows, so the number of splats rises only as long as this improves the scores of
+//! validation images. Models with few splats converge sooner, so an early trial may reject a useful doubling. Rejected
+//! doublings are therefore tried again after more training, and when many images are new.
+
+use super::schedule::GROWTH_PERIOD;
+use serde::{Deserialize, Serialize};
+
+/// Step of the first trial. Before it, the number of splats grows without trials.
+pub(crate) const DOUBLING_START: u64 = 800;
+/// Steps of each half of a trial. Both halves end just before a densification step, which would lower the scores for
+/// some steps.
+pub(crate) const DOUBLING_STEPS: u64 = 3 * GROWTH_PERIOD;
+/// A rejected doubling is tried again when training has taken this many times the steps.
+const RETRY_FACTOR: f64 = 1.5;
+/// Maximum share of the planned steps, or of the steps so far if these are more, that are spent on halves of trials
+/// whose result is discarded.
+const MAX_SHARE: f64 = 0.15;
+/// The search for the number of splats restarts when this share of the images is new.
+const NEW_SHARE: f64 = 0.25;
+
+/// Schedule of the trials.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct Doubling {
+    /// Step before which no trial starts.
+    not_before: u64,
+    /// Number of trials so far.
+    n_trials: u64,
+    /// Number of images that have arrived since the last restart.
+    n_new_images: u64,
+}
+
+impl Doubling {
+    /// Whether a trial may start at `step`. Trials start only at multiples of [`GROWTH_PERIOD`], where submits end.
+    pub(crate) fn is_due(&self, step: u64, n_planned_steps: u64) -> bool {
+        let max_discarded = MAX_SHARE * step.max(n_planned_steps) as f64;
+        let is_affordable = self.n_trials == 0 || ((self.n_trials + 1) * DOUBLING_STEPS) as f64 <= max_discarded;
+        step >= DOUBLING_START.max(self.not_before) && step.is_multiple_of(GROWTH_PERIOD) && is_affordable
+    }
+
+    /// Counts a trial that starts.
+    pub(crate) fn begin(&mut self) {
+        self.n_trials += 1;
+    }
+
+    /// Postpones the next trial after a rejection at `step`.
+    pub(crate) fn reject(&mut self, step: u64) {
+        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a multiple of a step")]
+        let retry = (RETRY_FACTOR * step as f64) as u64;
+        self.not_before = retry;
+    }
+
+    /// Counts an image that arrives.
+    pub(crate) fn add_image(&mut self) {
+        self.n_new_images += 1;
+    }
+
+    /// Whether the search must restart, because many of the `n_images` images are new. If so, allows the next trial.
+    pub(crate) fn restart(&mut self, n_images: usize) -> bool {
+        let is_due = self.n_new_images as f64 >= NEW_SHARE * n_images as f64 && self.n_new_images > 0;
+        if is_due {
+            (self.not_before, self.n_new_images) = (0, 0);
+        }
+        is_due
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const N_PLANNED: u64 = 7000;
+
+    #[test]
+    fn trials_take_a_limited_share_of_the_steps() {
+        let mut doubling = Doubling::default();
+        let mut due_at = |steps: std::ops::Range<u64>| {
+            let mut n = 0;
+            for step in steps {
+                if doubling.is_due(step, N_PLANNED) {
+                    doubling.begin();
+                    n += 1;
+                }
+            }
+            n
+        };
+        assert_eq!(due_at(0..DOUBLING_START), 0);
+        assert_eq!(due_at(DOUBLING_START..N_PLANNED), 3, "15 % of the planned steps");
+        assert_eq!(due_at(N_PLANNED..4 * N_PLANNED), 10, "15 % of the steps so far");
+        assert!(Doubling::default().is_due(900, 1000), "one trial is always affordable");
+    }
+
+    #[test]
+    fn rejected_doubling_is_retried_after_more_training_or_with_new_images() {
+        let mut doubling = Doubling::default();
+        doubling.reject(1000);
+        let is_due = |doubling: &Doubling, step| doubling.is_due(step, N_PLANNED);
+        assert_eq!([1000, 1400, 1500, 1550].map(|step| is_due(&doubling, step)), [false, false, true, false]);
+        for _ in 0..9 {
+            doubling.add_image();
+            assert!(!doubling.restart(40));
+        }
+        doubling.add_image();
+        assert!(doubling.restart(40) && is_due(&doubling, 1000));
+        assert!(!doubling.restart(40), "no image is new");
+    }
+}
