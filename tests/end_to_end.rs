@@ -603,7 +603,6 @@ fn without_depth_the_hand_eye_calibration_is_optimized_with_the_scene() {
     {
         events(folder, &[command, &common].concat());
         let (degrees, mm) = hand_eye_error(folder, rig);
-        println!("{folder_of_run}: {degrees:.3} degrees, {mm:.2} mm left");
         assert!(degrees < MAX_REMAINING_DEGREES && mm < MAX_REMAINING_MM, "{degrees:.3} degrees, {mm:.2} mm left");
         let report = std::fs::read_to_string(folder.join(folder_of_run).join("report.json")).expect("a report");
         let report: Value = serde_json::from_str(&report).expect("JSON");
