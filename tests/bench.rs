@@ -85,7 +85,7 @@ fn kernel_bench_reports_every_variant() {
     assert!(row["step_visible_millis"].as_f64() > Some(0.0), "{row}");
 }
 
-/// The counts that `--scan` is made for, with as many splats per pixel as in a scan: see docs/benchmarks/README.md.
+/// Checks the counts that `--scan` imitates (docs/benchmarks/README.md), with as many splats per pixel as a scan.
 #[test]
 fn kernel_bench_of_a_scan_has_uneven_lists() {
     let folder = tempfile::tempdir().expect("a folder");

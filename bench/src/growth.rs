@@ -57,7 +57,7 @@ pub enum Excluded {
 }
 
 impl Excluded {
-    /// The remaining resident memory, also without the times of pictures, which the viewers of a benchmark store.
+    /// Resident memory without the excluded part and without the picture timings that the viewers of a benchmark store.
     pub(crate) fn bytes(self, sample: &Sample) -> f64 {
         let excluded_bytes = match self {
             Self::Nothing => 0,

@@ -119,11 +119,11 @@ pub struct LiveRun {
 pub struct InputCounts {
     /// Color images.
     pub images: u64,
-    /// Color and depth images that were dropped, by devices or because they came too fast.
+    /// Color and depth images that were dropped, by devices or because they arrived too fast.
     pub dropped_images: u64,
     /// Range scans in the world frame.
     pub range_scans: u64,
-    /// Stations of the base after the first that were registered.
+    /// Registered stations of the base, not counting the first.
     pub stations: usize,
 }
 
@@ -281,7 +281,7 @@ pub fn findings(input: &str, runs: &[LiveRun]) -> Findings {
     let mut tables = vec![Table { title: "Live run".to_owned(), head: head.clone(), rows }];
     let rows = OverTime::rows(&runs.iter().map(|run| &run.over_time).collect::<Vec<_>>());
     if !rows.is_empty() {
-        tables.push(Table { title: "Second half: medians and changes".to_owned(), head, rows });
+        tables.push(Table { title: "Second half of the run: median and change per hour".to_owned(), head, rows });
     }
     let line = |run: &LiveRun| Line {
         label: run.conditions.to_string(),

@@ -15,7 +15,7 @@ use trainer::gpu::Gpu;
 const SAMPLE_PERIOD: Duration = Duration::from_secs(1);
 /// Maximum number of time buckets.
 const MAX_BUCKETS: usize = 60;
-/// Minimum time of the last sample of a run with trends: nearly two minutes.
+/// Minimum duration for trends: nearly two minutes, measured at the last sample.
 const MIN_SECS: f64 = 115.0;
 const SECS_PER_HOUR: f64 = 3600.0;
 const BYTES_PER_MB: f64 = 1e6;
@@ -104,8 +104,8 @@ pub struct Bucket {
     pub psnr: Option<f64>,
     /// Training steps per second.
     pub steps_per_sec: f64,
-    /// Resident memory without the times of pictures, which the viewers store, and, on a software adapter, without the
-    /// buffers of training; `None` if the system does not report it.
+    /// Resident memory without the picture timings that the viewers of a benchmark store and, on a software adapter,
+    /// without the buffers of training; `None` if the system does not report it.
     pub host_mb: Option<f64>,
 }
 

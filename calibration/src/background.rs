@@ -128,17 +128,17 @@ impl AlignmentTask {
     }
 }
 
-/// Detection of camera movements in the background, in keyframes that have the corrections of alignment.
+/// Detects camera movements in the background. Its keyframes already have the corrections of alignment.
 #[derive(Debug)]
 pub struct MovementTask {
     worker: Worker,
-    /// Keyframes to judge, in order of arrival.
+    /// Keyframes to test, in order of arrival.
     pending: Vec<Arc<Keyframe>>,
 }
 
 #[derive(Debug)]
 enum Worker {
-    /// The detector has not been created from its reference keyframes.
+    /// The detector has not yet been created from its reference keyframes.
     New(Vec<Arc<Keyframe>>),
     Idle(MovementDetector),
     Running(JoinHandle<(MovementDetector, Option<CameraMovement>)>),
@@ -147,17 +147,17 @@ enum Worker {
 }
 
 impl MovementTask {
-    /// Detection that compares keyframes with earlier ones.
+    /// Creates a task that compares later keyframes with `references`.
     pub fn new(references: Vec<Arc<Keyframe>>) -> Self {
         Self { worker: Worker::New(references), pending: Vec::new() }
     }
 
-    /// Adds a keyframe to judge.
+    /// Adds a keyframe to test.
     pub fn push(&mut self, keyframe: Arc<Keyframe>) {
         self.pending.push(keyframe);
     }
 
-    /// Starts to judge the waiting keyframes on its own thread, unless it is running.
+    /// Starts testing the pending keyframes on a background thread, unless one is already running.
     pub fn begin(&mut self) {
         if self.pending.is_empty() {
             return;
@@ -177,7 +177,7 @@ impl MovementTask {
         self.worker = Worker::Running(std::thread::spawn(|| run_in_background_pool(judge)));
     }
 
-    /// Returns a movement if one was found. With `wait`, judges all keyframes first.
+    /// Returns a movement if one was found. With `wait`, tests all keyframes first.
     pub fn poll(&mut self, wait: bool) -> Result<Option<CameraMovement>, Error> {
         loop {
             if wait {

@@ -84,8 +84,8 @@ pub struct CalibratedCamera {
     pub gains: [f64; 3],
 }
 
-/// Smaller differences between two calibrations of a camera do not matter: rotation (0.03 degrees), translation, and
-/// relative difference of the focal length.
+/// Maximum differences between two calibrations of a camera that are negligible: rotation (0.03 degrees), translation,
+/// and relative focal length.
 const NOTICEABLE_RAD: f64 = 5e-4;
 const NOTICEABLE_M: f64 = 5e-4;
 const NOTICEABLE_FOCAL: f64 = 1e-3;

@@ -255,7 +255,7 @@ impl Pump {
         InputResult { join: self.input.join, stations: self.input.stations, input_error, recording_error }
     }
 
-    /// Ends a round of a repeated source.
+    /// Handles a restart of the source: finishes pending images and stations.
     fn restart(&mut self) -> Result<(), TrainerGone> {
         let events = self.input.join.restart();
         self.forward(events)?;

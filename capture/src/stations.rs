@@ -151,8 +151,7 @@ impl Stations {
         released
     }
 
-    /// Starts again at the first station without a correction, because the source starts again. Returns the queued
-    /// changes in order.
+    /// Restarts at an uncorrected first station, because the source has restarted. Returns the queued changes in order.
     pub(crate) fn restart(&mut self) -> Vec<Change> {
         let released = self.finish();
         self.station = None;

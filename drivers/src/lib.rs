@@ -115,8 +115,8 @@ pub trait Source: Send {
         0
     }
 
-    /// Number of times, up to the latest sample, that the source has started again from its beginning. The robot is then
-    /// suddenly at another place, so nothing may be interpolated between the samples before and after.
+    /// Number of restarts of the source up to the latest sample. The robot's pose jumps at a restart, so samples before
+    /// and after it must not be interpolated.
     fn n_restarts(&self) -> u64 {
         0
     }

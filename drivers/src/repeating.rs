@@ -1,4 +1,4 @@
-//! Starts a recording again whenever it ends.
+//! Repeats a recording without end.
 
 use crate::{Error, Sample, Source};
 use kinematics::Stamp;
@@ -22,7 +22,7 @@ pub struct Repeating<Reopen> {
 }
 
 impl<Reopen: FnMut() -> Result<Box<dyn Source>, Error> + Send> Repeating<Reopen> {
-    /// Repeats `source`. `reopen` opens it again from its first sample.
+    /// Repeats `source`. `reopen` reopens it at its first sample.
     pub fn new(source: Box<dyn Source>, reopen: Reopen) -> Self {
         Self { source, reopen, offset_nanos: 0, span: None, n_restarts: 0 }
     }

@@ -9,7 +9,7 @@ use nalgebra::{Translation3, UnitQuaternion, Vector3};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-/// Values of `source` for a corrected time offset.
+/// Values of `source` in a corrected time offset.
 const ALIGNED: &str = "registration of keyframes";
 const LEARNED: &str = "optimization with the scene";
 
@@ -78,8 +78,8 @@ pub fn write(rig: &Rig, file: &Path) -> crate::Result<()> {
     std::fs::write(file, rig.to_toml()).with_context(in_file)
 }
 
-/// Applies a correction. `estimates` contain the standard deviation of the time offset, if it is known; `source` is its
-/// origin.
+/// Applies a correction. `estimates` contain the standard deviation of the time offset, if it is known; `source` names
+/// the method of estimation.
 fn correct(camera: &mut Camera, correction: &CameraCorrection, estimates: &[Estimate], source: &str) {
     let moved = |rotation_rad: [f64; 3], translation_m: [f64; 3]| {
         Transform::from_parts(

@@ -57,7 +57,7 @@ pub(crate) struct Args {
     /// arrive, and images that come too fast are dropped
     #[arg(long, requires = "from", conflicts_with = "steps_per_keyframe")]
     real_time: bool,
-    /// Play the recording again whenever it ends, until --seconds or --steps are over
+    /// Play the recording again whenever it ends, until the limit of --seconds or --steps is reached
     #[arg(long, requires = "real_time", conflicts_with = "record")]
     repeat: bool,
     /// Also write everything that the devices send to an MCAP file. Images that devices drop then count as a loss (exit
@@ -125,7 +125,7 @@ const RECORD: &str = "record";
 const FINAL_STATUS_TIME: Duration = Duration::from_millis(400);
 /// Steps between two keyframes if the flag is not given.
 const DEFAULT_STEPS_PER_KEYFRAME: u64 = 10;
-/// Keyframes wait during an evaluation, so it must be short, especially where the CPU draws the images.
+/// Keyframes wait during an evaluation, so it must be short, especially on a software adapter.
 const MAX_IMAGES_SCORED_LIVE: usize = 12;
 const MAX_IMAGES_SCORED_LIVE_ON_CPU: usize = 4;
 
@@ -314,7 +314,7 @@ pub(super) fn start(
     for finding in doctor::suspicious_values(&rig) {
         log::warn!("{finding}");
     }
-    // Before the first image, so that keyframes do not wait for the compiler.
+    // Compile kernels before the first image, so that keyframes do not wait.
     models.iter_mut().try_for_each(|model| model.method.prepare())?;
     let Opened { rig, source, damage, stamp_clock } = args.open(rig)?;
     args.print_address(&server.url())?;

@@ -91,7 +91,7 @@ struct AlignedState {
     begins_at: usize,
     n_steps_before_restart: u64,
     detects_movements: bool,
-    /// Number of keyframes that are the references of the detection of movements; `None` before it begins.
+    /// Number of reference keyframes of movement detection; `None` before it begins.
     n_references: Option<usize>,
     /// Camera and stamp of the keyframes, until alignment is done.
     keyframes: Vec<(String, i64)>,
@@ -243,7 +243,7 @@ impl<M: Recalibrate + 'static> Aligned<M> {
             match (&self.movements, n_begun) {
                 (None, Some(n_begun)) => self.detect_movements(n_begun),
                 (Some((_, n_references)), _) if is_changed => {
-                    // The latest keyframes are judged again with the new corrections.
+                    // The latest keyframes are tested again with the new corrections.
                     let n_older = self.original_keyframes.len().saturating_sub(MOVEMENT_WINDOW);
                     self.detect_movements(n_older.max(*n_references));
                 }
@@ -256,7 +256,7 @@ impl<M: Recalibrate + 'static> Aligned<M> {
         Ok(())
     }
 
-    /// Replaces the keyframes, whose corrections have changed.
+    /// Replaces the keyframes with their newly corrected versions.
     fn recalibrate(&mut self, previous: &AlignmentTask) -> Result<(), Error> {
         let Some(alignment) = self.alignment_task.result() else { return Ok(()) };
         let keyframes: Vec<_> = self
@@ -277,7 +277,7 @@ impl<M: Recalibrate + 'static> Aligned<M> {
         Ok(())
     }
 
-    /// Detects movements from now on: the first `n_references` keyframes are references, later ones are judged.
+    /// Detects movements from now on: the first `n_references` keyframes are references, later ones are tested.
     fn detect_movements(&mut self, n_references: usize) {
         let corrected = |keyframe: &Arc<Keyframe>| self.alignment_task.corrected(keyframe);
         let (references, later) = self.original_keyframes.split_at(n_references);
@@ -286,8 +286,8 @@ impl<M: Recalibrate + 'static> Aligned<M> {
         self.movements = Some((task, n_references));
     }
 
-    /// Applies a movement if one was found. With `wait`, judges all keyframes first. Returns whether a movement was
-    /// applied. During an alignment, no keyframes are judged.
+    /// Applies a movement if one was found. With `wait`, tests all keyframes first. Returns whether a movement was
+    /// applied. During an alignment, no keyframes are tested.
     fn poll_movement(&mut self, wait: bool) -> Result<bool, Error> {
         let (Some((task, _)), None) = (&mut self.movements, self.n_begun) else { return Ok(false) };
         let Some(movement) = task.poll(wait)? else { return Ok(false) };

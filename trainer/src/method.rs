@@ -107,12 +107,13 @@ pub trait Method {
     fn poll_alignment(&mut self, _wait: bool) -> Result<bool, Error> {
         Ok(false)
     }
-    /// Number of steps that must remain for a search for the model size that is due or running: the rest of the search,
-    /// and as many steps after it as the whole search takes. 0 if there is no search.
+    /// Number of steps that must remain for a search for the model size that is pending or running: the rest of the
+    /// search, and as many steps after it as the whole search takes. 0 if there is no search.
     fn n_steps_for_size_search(&self) -> u64 {
         0
     }
-    /// Ends a search for the model size that is due or running, with its result so far. Returns whether there was one.
+    /// Ends a search for the model size that is pending or running, with its result so far. Returns whether there was
+    /// one.
     fn end_size_search(&mut self) -> Result<bool, Error> {
         Ok(false)
     }

@@ -29,7 +29,7 @@ struct Shared {
     scene: watch::Sender<Option<Arc<SceneHint>>>,
     keyframes: watch::Sender<Arc<[KeyframePose]>>,
     live_images: watch::Sender<LiveImages>,
-    /// By camera: transform from the corrected to the reported camera frame.
+    /// For each camera: transform `reported_from_corrected`.
     camera_corrections: Mutex<BTreeMap<Arc<str>, Transform>>,
     queue: Mutex<Queue>,
     work_arrived: Condvar,
@@ -80,7 +80,7 @@ impl Hub {
         });
     }
 
-    /// Sets `reported_from_corrected` of each camera, by which the poses of later live images are corrected.
+    /// Sets `reported_from_corrected` of each camera, with which the poses of later live images are corrected.
     pub fn set_camera_corrections(&self, corrections: BTreeMap<Arc<str>, Transform>) {
         *self.shared.camera_corrections.lock() = corrections;
     }

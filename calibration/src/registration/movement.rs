@@ -1,14 +1,14 @@
 //! Detection of a camera that has moved relative to its mount.
 //!
-//! Each new image is compared with reference images, which are older than the last [`MOVEMENT_WINDOW`] images of its camera. If
-//! the camera has not moved, no motion that was estimated from earlier new images predicts the next one better. If it
-//! has moved, the same motion explains all images since then.
+//! Each new image is compared with reference images, which are older than the last [`MOVEMENT_WINDOW`] images of its
+//! camera. If the camera has not moved, no motion estimated from previous new images improves the prediction of the
+//! next one. If it has moved, one motion explains all images from then on.
 //!
 //! The test is a Shiryaev-Roberts e-detector (Shin, Ramdas and Rinaldo 2022), so it may be repeated with every image.
-//! For each possible start of the movement, a bet is placed on each later image: the motion estimated from the images
-//! between the start and this image improves its prediction. The stake is multiplied by a factor that is at most 1 on
-//! average if the camera has not moved. The probability that the sum of all stakes reaches [`ALARM`] within `n` images
-//! is therefore at most `n / ALARM`.
+//! For each possible start of the movement, a bet is placed that the motion estimated from the images since the start
+//! improves the prediction of each later image. The stake is multiplied by a factor that is at most 1 on average if the
+//! camera has not moved. The probability that the sum of all stakes reaches [`ALARM`] within `n` images is therefore at
+//! most `n / ALARM`.
 
 use super::corrections::Corrections;
 use super::fit;
@@ -27,23 +27,22 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 
-/// Number of the latest images of a camera after which a movement may have begun.
+/// Number of latest images of a camera that are considered as the start of a movement.
 pub const MOVEMENT_WINDOW: usize = 16;
 /// Maximum number of reference images. If there are more, every second one is dropped.
 const MAX_REFERENCES: usize = 48;
-/// Number of reference images with which an image is compared, and minimum number.
+/// Maximum and minimum number of reference images with which an image is compared.
 const MAX_PARTNERS: usize = 6;
 const MIN_PARTNERS: usize = 2;
-/// Sum of the stakes that reports a movement: at most 1 % false reports in 1000 images.
+/// Sum of stakes at which a movement is reported: at most 1 % false alarms in 1000 images.
 const ALARM: f64 = 1e5;
 /// Fraction of the stake that is bet on each image.
 const BET_FRAC: f64 = 0.8;
-/// Gain of the prediction that does not count, dB: other calibration errors may improve neighboring images by this
-/// much.
+/// Prediction gain that is ignored, dB: other calibration errors may improve neighboring images by this much.
 const MARGIN_DB: f64 = 0.2;
-/// Maximum loss that counts, dB.
+/// Losses are clamped to this value, dB.
 const MAX_LOSS_DB: f64 = 0.5;
-/// Smaller movements are not reported: they may be other calibration errors.
+/// Smaller movements are not reported, because they may be due to other calibration errors.
 const MIN_ROTATION_RAD: f64 = 0.005;
 const MIN_TRANSLATION_M: f64 = 0.003;
 /// Minimum share of the individual motions that a movement explains. Other calibration errors move each image differently.
@@ -58,7 +57,7 @@ pub struct CameraMovement {
     pub since_nanos: i64,
     /// Time of that image after the first keyframe, seconds.
     pub since_secs: f64,
-    /// Rotation vector (radians) and translation (meters) of the correction that images since then need, as in
+    /// Rotation vector (radians) and translation (meters) of the correction for images from then on, as in
     /// [`CameraCorrection`]. It is applied before all other corrections.
     pub rotation_rad: [f64; 3],
     /// See `rotation_rad`.
@@ -72,7 +71,7 @@ pub struct CameraMovement {
 }
 
 impl CameraMovement {
-    /// The correction that images since then need.
+    /// The correction for images from then on.
     pub(super) fn correction(&self) -> Transform {
         rigid_transform(self.rotation_rad.into(), self.translation_m.into())
     }
@@ -97,7 +96,7 @@ impl std::fmt::Display for CameraMovement {
 struct Judgment {
     is_reference: bool,
     /// Individual motion of the camera relative to the reference images (meters, then radians) and its information;
-    /// `None` if they do not show the same surfaces.
+    /// `None` if the image and the references show no common surfaces.
     motion: Option<(Vector6<f64>, Matrix6<f64>)>,
     /// Stake of the bets on a movement that began with this image.
     stake: f64,
@@ -125,8 +124,8 @@ impl MovementDetector {
         detector
     }
 
-    /// Judges the next keyframe, which has the same corrections as the references. Returns a movement if the keyframes so
-    /// far show one; the detector must then be replaced. The movement applies to the corrected keyframes.
+    /// Tests the next keyframe, which has the same corrections as the references. Returns a movement if one is
+    /// detected; create a new detector afterwards. The movement applies to the corrected keyframes.
     pub fn push(&mut self, keyframe: &Arc<Keyframe>) -> Option<CameraMovement> {
         let image = PreparedImage::new(keyframe, 0).filter(|_| is_used(keyframe))?;
         self.add(image, Judgment { stake: 1.0, ..Judgment::default() });
@@ -211,7 +210,7 @@ impl MovementDetector {
         information.try_inverse().map(|covariance| covariance * weighted)
     }
 
-    /// Share of the individual motions of images, weighted by their information, that their mean explains.
+    /// Share of the individual motions that their mean explains, weighted by information.
     fn explained_frac(&self, ixs: &[usize]) -> Option<f64> {
         let mean = self.mean_motion(ixs)?;
         let squares = |motion: &dyn Fn(&Vector6<f64>) -> Vector6<f64>| {
@@ -221,8 +220,8 @@ impl MovementDetector {
         Some(1.0 - squares(&|own| own - mean) / squares(&|own| *own))
     }
 
-    /// How much better reference images predict an image if its camera has made a motion; `None` if too few samples
-    /// are visible.
+    /// Gain in the prediction of an image from reference images if its camera has moved by `motion`, dB; `None` if too
+    /// few samples are visible.
     fn gain_db(&self, pairs: &[Pair], noise: Noise, motion: &Vector6<f64>) -> Option<f64> {
         let ix = pairs.first()?.to;
         let moved = CorrectedView::new(&self.images[ix], &correction_of(motion), &Layout::default())?;
@@ -234,7 +233,7 @@ impl MovementDetector {
         let stake = |position: &usize| self.judgments[recent[*position]].stake;
         let start = (0..recent.len()).max_by(|one, other| stake(one).total_cmp(&stake(other)))?;
         let motion = self.mean_motion(&recent[start..])?;
-        // The first image since which the motion improves the predictions the most.
+        // The first image from which on the motion improves predictions the most.
         let references = self.references();
         let pairs_of = |ix: &usize| pairs::choose(&self.images, &self.views, &references, &[*ix], MAX_PARTNERS);
         let pairs: Vec<Vec<Pair>> = recent.iter().map(pairs_of).collect();
@@ -322,7 +321,7 @@ mod tests {
     /// Index of the first image after the movement.
     const MOVED_AT: usize = 26;
 
-    /// Judges the images after the references; returns the movement, and the number of images until it was found.
+    /// Tests the images after the references; returns the movement, and the number of images until it was found.
     fn detect(keyframes: &[Arc<Keyframe>]) -> Option<(CameraMovement, usize)> {
         let mut detector = MovementDetector::new(&keyframes[..N_REFERENCES]);
         let mut later = keyframes.iter().enumerate().skip(N_REFERENCES);
@@ -355,8 +354,9 @@ mod tests {
     #[test]
     fn undisturbed_scans_have_no_movement() {
         let none = Miscalibration::none();
-        let mut scans: Vec<Miscalibration> = (0..12)
-            .map(|seed| Miscalibration { seed: 2 + seed, noise: [0.5, 1.0, 3.0][seed as usize % 3], ..none.clone() })
+        let mut scans: Vec<Miscalibration> = (2..14)
+            .zip([0.5, 1.0, 3.0].into_iter().cycle())
+            .map(|(seed, noise)| Miscalibration { seed, noise, ..none.clone() })
             .collect();
         // Errors that registration has not corrected yet.
         scans.extend(

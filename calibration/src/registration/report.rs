@@ -310,7 +310,7 @@ impl Alignment {
         self.camera(keyframe, None).differs_noticeably(&other.camera(keyframe, None))
     }
 
-    /// The camera of a keyframe with these corrections, followed by one that was optimized with the scene.
+    /// The camera of a keyframe with these corrections, followed by a correction that was optimized with the scene.
     pub fn camera(&self, keyframe: &Keyframe, learned: Option<&CameraCorrection>) -> CalibratedCamera {
         let correction = self.corrections.get(&*keyframe.camera);
         let color_from_depth = keyframe.depth.as_ref().map(|depth| match correction {
@@ -339,7 +339,7 @@ impl Alignment {
         }
     }
 
-    /// Correction of a camera's movements until a stamp; `None` without movements.
+    /// Combined correction of a camera's movements up to a stamp; `None` if there are none.
     pub fn movement_correction(&self, camera: &str, stamp: Stamp) -> Option<CameraCorrection> {
         let movements =
             self.movements.iter().filter(|movement| movement.camera == camera && movement.since_nanos <= stamp.0);
@@ -348,7 +348,7 @@ impl Alignment {
         Some(CameraCorrection { rotation_rad, translation_m, ..CameraCorrection::default() })
     }
 
-    /// Adds a movement of keyframes to which these corrections have been applied. `first` is the stamp of the first
+    /// Adds a movement that was estimated from keyframes with these corrections. `first` is the stamp of the first
     /// keyframe.
     pub fn add_movement(&mut self, movement: CameraMovement, first: Stamp) {
         let extrinsics = self.corrections.get(&movement.camera).map_or(Transform::identity(), |correction| {

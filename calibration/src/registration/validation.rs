@@ -108,8 +108,8 @@ pub(super) fn scores(
     by_image.into_values().map(psnr).unzip()
 }
 
-/// Gain of the prediction of an image if its view is replaced, dB; `None` if too few samples are visible. All pairs must
-/// lead to this image.
+/// Gain of the prediction of an image if its view is replaced, dB; `None` if too few samples are visible. All pairs
+/// must end at this image.
 pub(super) fn gain_db(
     images: &[PreparedImage],
     views: &[CorrectedView],

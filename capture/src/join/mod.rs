@@ -214,8 +214,8 @@ impl Join {
         events
     }
 
-    /// Decides about the images that are still waiting, because the source starts again. Its stamps continue to
-    /// increase, but the robot jumps back, so the motion up to now is not used for later images.
+    /// Accepts or rejects all pending images, because the source has restarted. Its stamps continue to increase, but
+    /// the robot jumps back, so the motion up to now is not used for later images.
     pub(crate) fn restart(&mut self) -> Vec<JoinEvent> {
         let events = self.finish();
         self.motion.restart();

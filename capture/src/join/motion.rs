@@ -130,7 +130,7 @@ impl Motion {
         }
     }
 
-    /// Forgets all readings.
+    /// Discards all readings.
     pub(super) fn restart(&mut self) {
         self.joints.clear();
         if let BaseMotion::ReportedPoses(reported) = &mut self.base {

@@ -51,7 +51,7 @@ impl StationDetector {
         }
     }
 
-    /// Ends the current station, because the base is suddenly at another place.
+    /// Ends the current station, because the base pose has jumped.
     pub(super) fn restart(&mut self) {
         self.stationary_since = None;
     }

@@ -58,7 +58,7 @@ impl Opened {
         Self { stamp_clock: StampClock::Playback(playback.clock()), source: Box::new(playback), ..self }
     }
 
-    /// Starts the recording at `path` again whenever it ends.
+    /// Repeats the recording at `path` without end.
     #[must_use]
     pub fn repeated(self, path: &Path) -> Self {
         let (path, damage) = (path.to_owned(), Arc::clone(&self.damage));

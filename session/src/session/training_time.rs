@@ -149,7 +149,7 @@ mod tests {
         let mut time = TrainingTime::new(Limits { seconds: Some(40.0), steps: None });
         time.start(Instant::now().checked_sub(Duration::from_secs(30)).expect("the machine has run for 30 s"));
         assert_eq!(time.n_steps_in_time(), None, "no step yet");
-        time.first_step_secs = Some(10.0); // The run waited for keyframes before.
+        time.first_step_secs = Some(10.0); // Until then, the run waited for keyframes.
         time.add_steps(100);
         let n_left = time.n_steps_in_time().expect("a limit");
         assert!((n_left - 50.0).abs() < 2.0, "{n_left}");

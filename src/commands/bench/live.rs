@@ -24,8 +24,8 @@ pub(crate) struct Args {
     /// Length of each run in seconds, counted from the first image. After the end of the recording, training continues
     #[arg(long, value_name = "S", default_value_t = 60.0, value_parser = super::super::number_in_range(1.0..=1e6))]
     seconds: f64,
-    /// Play the recording again whenever it ends. From two minutes on, the changes of latency, accuracy, training speed
-    /// and memory per hour are reported
+    /// Play the recording again whenever it ends. If a run takes two minutes or more, the change per hour of latency,
+    /// accuracy, training speed and memory is reported
     #[arg(long)]
     repeat: bool,
     /// Numbers of viewers that request pictures back to back, one run each

@@ -9,7 +9,7 @@ use crate::{Error, Picture, Projection, RenderRequest};
 
 /// MCUs (8 x 8 pixels, no subsampling) per restart interval, which one lane encodes.
 const MCUS_PER_INTERVAL: u32 = 2;
-/// Capacity of an interval, in words: four times the average of a file of [`WORDS_PER_MCU`].
+/// Capacity of an interval, in words: four times the average at [`WORDS_PER_MCU`].
 const WORDS_PER_INTERVAL: u32 = 4 * WORDS_PER_MCU * MCUS_PER_INTERVAL;
 /// Maximum average of coded words per MCU. At quality 92, pictures of splats need about 6.
 const WORDS_PER_MCU: u32 = 16;

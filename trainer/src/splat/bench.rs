@@ -29,7 +29,7 @@ const RATE: f32 = 1e-5;
 
 /// Depth that the images of [`Losses::Training`] show, meters.
 const DEPTH_M: f32 = 3.2;
-/// Number of images, so many that few-image regularization is off.
+/// Number of images; large enough to turn off few-image regularization.
 const N_IMAGES: usize = 1000;
 
 /// Results for one image size and cloud.
@@ -48,7 +48,7 @@ pub struct KernelFigures {
     pub step_millis: f64,
     /// Median GPU time of a step that updates only visible splats, milliseconds.
     pub step_visible_millis: f64,
-    /// Number of splats in the view.
+    /// Number of splats in view.
     pub n_splats_in_view: u64,
     /// Mean wall time of consecutive pictures, milliseconds.
     pub render_wall_millis: f64,
@@ -90,7 +90,7 @@ pub enum Losses {
     Training,
 }
 
-/// What is drawn and compared.
+/// What is rendered and compared.
 #[derive(Clone, Copy, Debug)]
 pub struct KernelSetup {
     /// Size of the image, pixels.

@@ -17,7 +17,7 @@ const N_COEFFICIENTS: usize = 16;
 /// Patches of [`scan_cloud`]: center and standard deviation, meters.
 const PATCHES: [([f64; 2], f64); 4] =
     [([-0.5, 0.2], 0.1), ([0.3, -0.3], 0.14), ([0.7, 0.4], 0.2), ([-1.1, -0.6], 0.14)];
-/// Fractions of the splats in patches, and of large splats.
+/// Fraction of splats in patches, and fraction of large splats.
 const PATCH_FRAC: f64 = 0.25;
 const LARGE_FRAC: f64 = 0.005;
 /// Number of splats that cover the whole image.
@@ -59,8 +59,8 @@ fn random_color(random: &mut Random) -> [[f32; 3]; N_COEFFICIENTS] {
 /// Generates `n_splats` splats like those of a scan with depth, for a camera at z = -3.2 that looks along z. Equal seeds
 /// give equal splats.
 ///
-/// Most splats are flat and lie on an uneven wall around z = 0, whose edges are outside of an image with a focal length
-/// of 0.9 image widths. [`PATCH_FRAC`] of them are smaller and lie in a few [`PATCHES`], where the lists of the tiles are
+/// Most splats are flat and lie on an uneven wall around z = 0, whose edges lie outside an image with a focal length of
+/// 0.9 image widths. [`PATCH_FRAC`] of them are smaller and lie in a few [`PATCHES`], where the lists of the tiles are
 /// several times longer. [`LARGE_FRAC`] of them are large, and [`N_HUGE`] cover the whole image.
 #[expect(clippy::cast_possible_truncation, reason = "drawn in f64, used in f32")]
 pub fn scan_cloud(n_splats: usize, seed: u64) -> SplatArrays {

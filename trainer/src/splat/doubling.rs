@@ -1,4 +1,4 @@
-//! When trials double the number of splats of a model whose images arrive during training.
+//! Schedule of the trials that double the number of splats while images arrive.
 //!
 //! The trials run while the model grows, so the number of splats rises only as long as this improves the scores of
 //! validation images. Models with few splats converge sooner, so an early trial may reject a useful doubling. Rejected
@@ -12,10 +12,10 @@ pub(crate) const DOUBLING_START: u64 = 800;
 /// Steps of each half of a trial. Both halves end just before a densification step, which would lower the scores for
 /// some steps.
 pub(crate) const DOUBLING_STEPS: u64 = 3 * GROWTH_PERIOD;
-/// A rejected doubling is tried again when training has taken this many times the steps.
+/// A rejected doubling is tried again at this multiple of the step at which it was rejected.
 const RETRY_FACTOR: f64 = 1.5;
-/// Maximum share of the planned steps, or of the steps so far if these are more, that are spent on halves of trials
-/// whose result is discarded.
+/// Maximum share of the planned steps, or of the steps so far if these are more, that are spent on the discarded halves
+/// of trials.
 const MAX_SHARE: f64 = 0.15;
 /// The search for the number of splats restarts when this share of the images is new.
 const NEW_SHARE: f64 = 0.25;

@@ -118,7 +118,7 @@ pub(crate) fn n_steps_of_first_round(step: u64, n_folds: usize) -> u64 {
 }
 
 impl FoldModels {
-    /// Number of steps that are left until the end of this round, and of all steps up to then.
+    /// Number of steps left in this round, and total number of steps of the search up to the end of this round.
     pub(crate) fn n_steps(&self, step: u64) -> (u64, u64) {
         let warm_up = self.main.schedule.step.min(MAX_WARM_UP);
         let n_folds = self.folds.len() as u64;

@@ -101,7 +101,7 @@ impl SplatTrainer {
         } else {
             return Ok(false);
         };
-        log::info!("too little training time is left to test the number of splats; it is limited to {n_splats}");
+        log::info!("too little training time is left to test more splats; their number is limited to {n_splats}");
         self.abort_growth_search()?;
         self.growth_search = GrowthSearch::Finished(GrowthLimit { n_splats, n_images: self.n_images() });
         Ok(true)

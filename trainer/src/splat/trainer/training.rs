@@ -96,7 +96,7 @@ impl SplatTrainer {
         let is_full = self.model.is_full();
         self.model.grow(&mut self.recorder, &mut self.renderer, &learn, n_more, key)?;
         if self.model.splats.n_splats < n_splats {
-            self.model.set_full(is_full); // There may be enough memory once the copies of the model are freed.
+            self.model.set_full(is_full); // Freeing the copies of the model may make enough memory available.
             return Err(Error::OutOfMemory { label: "splat.doubled".to_owned(), bytes: 0 });
         }
         Ok(())
