@@ -28,7 +28,7 @@ const DEFAULTS: Defaults = Defaults {
 const DEFAULTS_ON_CPU: Defaults = Defaults { sizes_px: &[[320, 240]], n_splats: &[10_000, 30_000], n_repeats: 3 };
 /// Defaults of [`KernelsOptions::scan`].
 const SCAN_DEFAULTS: Defaults = Defaults { sizes_px: &[[640, 480]], n_splats: &[400_000], n_repeats: 30 };
-/// Defaults on the CPU, with roughly as many splats per pixel as on a GPU.
+/// Defaults on the CPU, with as many splats per pixel as on a GPU.
 const SCAN_DEFAULTS_ON_CPU: Defaults = Defaults { sizes_px: &[[160, 120]], n_splats: &[25_000], n_repeats: 3 };
 
 /// Options of [`measure`].

@@ -18,7 +18,7 @@ use calibration::{
 use keyframe::{Keyframe, Split};
 use kinematics::Stamp;
 use serde::{Deserialize, Serialize};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashMap};
 use std::path::Path;
 use std::sync::Arc;
 
@@ -38,6 +38,16 @@ pub struct CorrectedKeyframe {
     pub before: Arc<Keyframe>,
     /// With the new corrections.
     pub after: Arc<Keyframe>,
+}
+
+/// Replaces a keyframe with its version after the corrections.
+pub(crate) fn replacement(keyframes: &[CorrectedKeyframe]) -> impl Fn(&mut Arc<Keyframe>) {
+    let after: HashMap<_, _> = keyframes.iter().map(|keyframe| (id_of(&keyframe.before), &keyframe.after)).collect();
+    move |keyframe| {
+        if let Some(after) = after.get(&id_of(keyframe)).copied() {
+            *keyframe = Arc::clone(after);
+        }
+    }
 }
 
 /// A model whose cameras can be corrected during training.
@@ -74,6 +84,8 @@ pub struct Aligned<M> {
     n_steps_before_restart: u64,
     /// Whether movements of cameras are detected after the first alignment of a live run.
     detects_movements: bool,
+    /// Stamp of the first keyframe, which may have been evicted since.
+    first_stamp: Option<Stamp>,
     /// Detection of movements, and the number of original keyframes that are its references.
     movements: Option<(MovementTask, usize)>,
 }
@@ -90,7 +102,10 @@ struct AlignedState {
     timing: AlignTiming,
     begins_at: usize,
     n_steps_before_restart: u64,
+    #[serde(default)]
     detects_movements: bool,
+    /// Stamp of the first keyframe, nanoseconds.
+    first_nanos: Option<i64>,
     /// Number of reference keyframes of movement detection; `None` before it begins.
     n_references: Option<usize>,
     /// Camera and stamp of the keyframes, until alignment is done.
@@ -117,6 +132,7 @@ impl<M: Recalibrate + 'static> Aligned<M> {
             begins_at: 0,
             n_steps_before_restart: 0,
             detects_movements: false,
+            first_stamp: None,
             movements: None,
         }
     }
@@ -164,6 +180,7 @@ impl<M: Recalibrate + 'static> Aligned<M> {
             begins_at,
             n_steps_before_restart,
             detects_movements,
+            first_nanos,
             n_references,
             keyframes: ids,
             n_begun,
@@ -191,6 +208,7 @@ impl<M: Recalibrate + 'static> Aligned<M> {
             begins_at,
             n_steps_before_restart,
             detects_movements,
+            first_stamp: first_nanos.map(Stamp),
             movements: None,
         };
         if let Some(n_references) = n_references {
@@ -244,8 +262,8 @@ impl<M: Recalibrate + 'static> Aligned<M> {
                 (None, Some(n_begun)) => self.detect_movements(n_begun),
                 (Some((_, n_references)), _) if is_changed => {
                     // The latest keyframes are tested again with the new corrections.
-                    let n_older = self.original_keyframes.len().saturating_sub(MOVEMENT_WINDOW);
-                    self.detect_movements(n_older.max(*n_references));
+                    let n_older = first_recent(&self.original_keyframes, MOVEMENT_WINDOW).max(*n_references);
+                    self.detect_movements(n_older);
                 }
                 _ => {}
             }
@@ -291,7 +309,7 @@ impl<M: Recalibrate + 'static> Aligned<M> {
     fn poll_movement(&mut self, wait: bool) -> Result<bool, Error> {
         let (Some((task, _)), None) = (&mut self.movements, self.n_begun) else { return Ok(false) };
         let Some(movement) = task.poll(wait)? else { return Ok(false) };
-        let first = self.original_keyframes.first().map_or(Stamp(movement.since_nanos), |keyframe| keyframe.stamp);
+        let first = self.first_stamp.unwrap_or(Stamp(movement.since_nanos));
         let previous = AlignmentTask::done(self.alignment_task.result().cloned());
         self.alignment_task.add_movement(movement, first);
         if let Some(movement) = self.alignment_task.result().and_then(|alignment| alignment.movements.last()) {
@@ -325,15 +343,16 @@ impl<M: Recalibrate + 'static> Aligned<M> {
 
 impl<M: Recalibrate + 'static> Method for Aligned<M> {
     fn push(&mut self, keyframe: Arc<Keyframe>) -> Result<(), Error> {
+        let is_used = !self.alignment_task.is_done() && keyframe.split != Split::Test && keyframe.is_finite();
         // Validation keyframes are pushed again after resuming.
-        let is_new = !self.original_keyframes.iter().any(|known| id_of(known) == id_of(&keyframe));
+        let is_new = is_used && !self.original_keyframes.iter().any(|known| id_of(known) == id_of(&keyframe));
         if is_new && self.timing == AlignTiming::Lockstep {
             self.poll_movement(true)?;
         }
         let corrected = self.alignment_task.corrected(&keyframe);
         self.model.push(corrected.clone())?;
-        let is_used = !self.alignment_task.is_done() && keyframe.split != Split::Test && keyframe.is_finite();
-        if is_used && is_new {
+        if is_new {
+            self.first_stamp.get_or_insert(keyframe.stamp);
             self.original_keyframes.push(keyframe);
             if let Some((task, _)) = &mut self.movements {
                 task.push(corrected);
@@ -486,6 +505,7 @@ impl<M: Recalibrate + 'static> Method for Aligned<M> {
             begins_at: self.begins_at,
             n_steps_before_restart: self.n_steps_before_restart,
             detects_movements: self.detects_movements,
+            first_nanos: self.first_stamp.map(|stamp| stamp.0),
             n_references: self.movements.as_ref().map(|(_, n_references)| *n_references),
             keyframes: self
                 .original_keyframes
@@ -505,6 +525,20 @@ impl<M: Recalibrate + 'static> Method for Aligned<M> {
             Ok(checkpoint)
         }))
     }
+}
+
+/// Index of the first keyframe that is among the last `n` of its camera.
+fn first_recent(keyframes: &[Arc<Keyframe>], n: usize) -> usize {
+    let mut n_later = BTreeMap::<&str, usize>::new();
+    let mut first = keyframes.len();
+    for (ix, keyframe) in keyframes.iter().enumerate().rev() {
+        let n_of_camera = n_later.entry(&keyframe.camera).or_default();
+        *n_of_camera += 1;
+        if *n_of_camera <= n {
+            first = ix;
+        }
+    }
+    first
 }
 
 /// Number of keyframes at which the next alignment of a live run begins after one with `n`.
@@ -553,21 +587,25 @@ mod tests {
     }
 
     #[test]
-    fn models_restart_with_corrected_cameras_and_resume_exactly() {
+    fn models_get_corrected_cameras_and_resume_exactly() {
+        /// Steps after the first one that follows the correction.
+        const RESTARTED: u64 = 1;
         let gpu = Gpu::open(&GpuOptions::default()).unwrap();
-        check_restart(&gpu, tsdf(&gpu), TsdfModel::resume, TsdfModel::load);
-        check_restart(&gpu, nerf(&gpu), NerfModel::resume, NerfModel::load);
-        check_restart(
+        check_correction(&gpu, tsdf(&gpu), RESTARTED, TsdfModel::resume, TsdfModel::load);
+        check_correction(&gpu, nerf(&gpu), ALIGNMENT_STEP + 1, NerfModel::resume, NerfModel::load);
+        check_correction(
             &gpu,
             MeanColor::new(ModelOptions::default()),
+            RESTARTED,
             |_, checkpoint, keyframes| MeanColor::resume(checkpoint, keyframes),
             |_, folder| MeanColor::load(folder),
         );
     }
 
-    fn check_restart<M: Recalibrate + 'static>(
+    fn check_correction<M: Recalibrate + 'static>(
         gpu: &Arc<Gpu>,
         model: M,
+        n_steps_after_correction: u64,
         resume: Resume<M>,
         load: fn(Arc<Gpu>, &Path) -> Result<M, Error>,
     ) {
@@ -585,8 +623,7 @@ mod tests {
         train(&mut uninterrupted, 1);
         assert_eq!(
             (uninterrupted.progress().step, uninterrupted.n_total_steps().unwrap()),
-            (1, ALIGNMENT_STEP + 1),
-            "the model must have restarted"
+            (n_steps_after_correction, ALIGNMENT_STEP + 1)
         );
         let correction = uninterrupted.alignment().unwrap().corrections["wrist"].clone();
         let (degrees, mm) = remaining(&correction, &miscalibration.extrinsics);
@@ -739,7 +776,8 @@ mod tests {
         train_on(&mut uninterrupted, &keyframes[N_FIRST..n_before]);
         let checkpoint = uninterrupted.checkpoint().unwrap().finish().unwrap();
         let resume = |own: &Checkpoint, keyframes: &[Arc<Keyframe>]| MeanColor::resume(own, keyframes);
-        let (mut resumed, _) = Aligned::resume(&checkpoint, &keyframes[..n_before], resume).unwrap();
+        let (mut resumed, untrained) = Aligned::resume(&checkpoint, &keyframes[..n_before], resume).unwrap();
+        untrained.into_iter().for_each(|keyframe| resumed.push(keyframe).unwrap());
         let ends = [&mut uninterrupted as &mut dyn Method, &mut *resumed].map(|model| {
             train_on(model, &keyframes[n_before..]);
             model.checkpoint().unwrap().finish().unwrap()

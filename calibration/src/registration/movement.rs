@@ -250,7 +250,11 @@ impl MovementDetector {
         let pairs = pairs[start..].concat();
         let mut initial = Corrections::none(2);
         initial.by_camera[1] = correction_of(&motion);
-        let found = fit::fit(&self.images, &pairs, Layout::extrinsics_of(1), &initial)?;
+        let found = fit::fit(&self.images, &pairs, Layout::extrinsics_of(1), &initial);
+        for ix in moved {
+            self.images[*ix].camera = 0; // If the movement is rejected, they become references.
+        }
+        let found = found?;
         let CameraCorrection { rotation_rad, translation_m, .. } = found.corrections.by_camera[1];
         let sigma = |vector: [f64; 3], begin: usize| {
             let axis = Vector3::from(vector).try_normalize(0.0).unwrap_or_else(Vector3::zeros);
@@ -290,7 +294,8 @@ impl MovementDetector {
 }
 
 fn is_used(keyframe: &Keyframe) -> bool {
-    keyframe.split != Split::Test && keyframe.depth.is_some()
+    // Evicted keyframes have no pixels after recovery.
+    keyframe.split != Split::Test && keyframe.depth.is_some() && !keyframe.rgba_srgb.is_empty()
 }
 
 fn finest(noise: Noise) -> ResidualOptions {

@@ -9,6 +9,7 @@ use super::field_trainer::{Compiled, FieldTrainer, STEPS_PER_SUBMIT};
 use super::options::{NerfBudget, NerfOptions};
 use super::rays::{self, RayImage, RaySampling};
 use super::sizes::Sizes;
+use crate::aligned::replacement;
 use crate::checkpoint::PendingCheckpoint;
 use crate::gpu::{Gpu, PassTiming};
 use crate::model_options::ModelOptions;
@@ -26,6 +27,7 @@ use keyframe::{Keyframe, Split};
 use kinematics::Stamp;
 use rayon::prelude::*;
 use std::collections::BTreeMap;
+use std::ops::Range;
 use std::path::Path;
 use std::sync::Arc;
 use std::time::Instant;
@@ -170,12 +172,19 @@ impl NerfModel {
     /// Applies occupancy hints of new images, if any image has depth, and initializes their appearance embeddings.
     fn hint(&mut self) -> Result<(), Error> {
         self.initialize_embeddings()?;
+        self.hint_images(self.n_hinted..self.images.len())?;
+        if self.field.is_some() {
+            self.n_hinted = self.images.len();
+        }
+        Ok(())
+    }
+
+    fn hint_images(&mut self, images: Range<usize>) -> Result<(), Error> {
         let Some((extent, field_trainer)) = &mut self.field else { return Ok(()) };
         if field_trainer.sizes.has_depth {
-            let keyframes: Vec<&Keyframe> = self.images[self.n_hinted..].iter().map(|image| &*image.keyframe).collect();
+            let keyframes: Vec<&Keyframe> = self.images[images].iter().map(|image| &*image.keyframe).collect();
             field_trainer.hint(&self.gpu, &carve::hints(&keyframes, extent, &field_trainer.march()))?;
         }
-        self.n_hinted = self.images.len();
         Ok(())
     }
 
@@ -253,14 +262,21 @@ impl NerfModel {
 }
 
 impl Recalibrate for NerfModel {
-    /// Restarts: the field cannot be moved.
+    /// Continues with the corrected images. Pose corrections of single images start again at zero.
     fn recalibrate(&mut self, keyframes: &[CorrectedKeyframe], _: &Alignment) -> Result<(), Error> {
         self.finish_in_flight()?;
-        let compiled = self.compiled.take();
-        let is_watched = self.submits.is_watched();
-        *self = Self { compiled, ..Self::new(self.gpu.clone(), self.options.clone())? };
-        self.set_watched(is_watched);
-        keyframes.iter().try_for_each(|keyframe| self.push(keyframe.after.clone()))
+        self.undo_trial()?;
+        let corrected = replacement(keyframes);
+        for image in self.images.iter_mut().chain(&mut self.validation_images) {
+            let mut keyframe = image.keyframe.clone();
+            corrected(&mut keyframe);
+            *image = RayImage::new(keyframe);
+        }
+        (self.is_extent_stale, self.corrections) = (true, None);
+        if let Some((_, field_trainer)) = &mut self.field {
+            field_trainer.reset_image_params_except(&self.gpu, self.learned_params - ParamSet::IMAGE_POSES)?;
+        }
+        self.hint_images(0..self.n_hinted)
     }
 }
 

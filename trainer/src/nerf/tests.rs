@@ -11,8 +11,8 @@ use crate::eval::{self, PixelPair};
 use crate::gpu::{Gpu, GpuOptions};
 use crate::model_options::{CommonOptions, ModelOptions};
 use crate::test_scenes as scenes;
-use crate::{Aabb, Error, Method, ModelKind, Picture, Projection, RenderRequest};
-use calibration::{CameraRefinement, ParamSet, rigid_transform};
+use crate::{Aabb, CorrectedKeyframe, Error, Method, ModelKind, Picture, Projection, Recalibrate, RenderRequest};
+use calibration::{Alignment, CameraCorrection, CameraRefinement, ParamSet, rigid_transform};
 use keyframe::{DepthMap, Keyframe, Split};
 use kinematics::{Stamp, Transform, Twist};
 use nalgebra::{Point3, Vector3};
@@ -584,4 +584,43 @@ fn depth_holes_mark_no_free_space() {
         hint_next_to_hole.iter().filter(|hint| **hint >> 30 == 0).count() > 500,
         "pixels outside the depth image must mark cells as unbounded"
     );
+}
+
+/// Errors of the extrinsics: 1 degree and 5 mm.
+fn with_wrong_extrinsics(keyframe: &Arc<Keyframe>) -> Arc<Keyframe> {
+    let correction = CameraCorrection {
+        rotation_rad: [0.01, 0.012, -0.008],
+        translation_m: [0.003, -0.0035, 0.002],
+        ..CameraCorrection::default()
+    };
+    Arc::new(correction.corrected(keyframe))
+}
+
+#[test]
+fn training_continues_with_corrected_cameras() {
+    const N_BEFORE: u64 = 120;
+    const N_AFTER: u64 = 40;
+    let all = ball_on_floor(9);
+    let (test_view, seen) = (&all[4], [&all[..4], &all[5..]].concat());
+    let psnr_of = |model: &mut NerfModel| psnr(&model.render(&request(test_view)).unwrap(), test_view);
+    let wrong: Vec<_> = seen.iter().map(with_wrong_extrinsics).collect();
+    let corrected: Vec<_> = wrong
+        .iter()
+        .zip(&seen)
+        .map(|(before, after)| CorrectedKeyframe { before: before.clone(), after: after.clone() })
+        .collect();
+    let mut continued = model_with(options(), &wrong);
+    train_until(&mut continued, N_BEFORE);
+    let before = psnr_of(&mut continued);
+    continued.recalibrate(&corrected, &Alignment::default()).unwrap();
+    assert_eq!(continued.n_total_steps().unwrap(), N_BEFORE);
+    let mut restarted = model_with(options(), &seen);
+    let mut scores = Vec::new();
+    for n in [N_AFTER, 2 * N_AFTER, 4 * N_AFTER] {
+        train_until(&mut continued, N_BEFORE + n);
+        train_until(&mut restarted, n);
+        scores.push([psnr_of(&mut continued), psnr_of(&mut restarted)]);
+    }
+    let report = format!("{before:.2} dB before; continued, restarted: {scores:.2?}");
+    assert!(scores[0][0] > scores[0][1] + 1.0 && scores[2][0] > scores[2][1] - 0.2, "{report}");
 }

@@ -28,8 +28,8 @@ pub(crate) struct Doubling {
     not_before: u64,
     /// Number of trials so far.
     n_trials: u64,
-    /// Number of images that have arrived since the last restart.
-    n_new_images: u64,
+    /// Number of images at the last restart.
+    n_images: usize,
 }
 
 impl Doubling {
@@ -52,16 +52,12 @@ impl Doubling {
         self.not_before = retry;
     }
 
-    /// Counts an image that arrives.
-    pub(crate) fn add_image(&mut self) {
-        self.n_new_images += 1;
-    }
-
     /// Whether the search must restart, because many of the `n_images` images are new. If so, allows the next trial.
     pub(crate) fn restart(&mut self, n_images: usize) -> bool {
-        let is_due = self.n_new_images as f64 >= NEW_SHARE * n_images as f64 && self.n_new_images > 0;
+        let n_new = n_images.saturating_sub(self.n_images); // Images are pushed again after resuming.
+        let is_due = n_new > 0 && n_new as f64 >= NEW_SHARE * n_images as f64;
         if is_due {
-            (self.not_before, self.n_new_images) = (0, 0);
+            (self.not_before, self.n_images) = (0, n_images);
         }
         is_due
     }
@@ -95,15 +91,12 @@ mod tests {
     #[test]
     fn rejected_doubling_is_retried_after_more_training_or_with_new_images() {
         let mut doubling = Doubling::default();
+        assert!(doubling.restart(40));
         doubling.reject(1000);
         let is_due = |doubling: &Doubling, step| doubling.is_due(step, N_PLANNED);
         assert_eq!([1000, 1400, 1500, 1550].map(|step| is_due(&doubling, step)), [false, false, true, false]);
-        for _ in 0..9 {
-            doubling.add_image();
-            assert!(!doubling.restart(40));
-        }
-        doubling.add_image();
-        assert!(doubling.restart(40) && is_due(&doubling, 1000));
-        assert!(!doubling.restart(40), "no image is new");
+        assert!((1..=53).all(|n_images| !doubling.restart(n_images)) && !is_due(&doubling, 1000));
+        assert!(doubling.restart(54) && is_due(&doubling, 1000));
+        assert!(!doubling.restart(54), "no image is new");
     }
 }

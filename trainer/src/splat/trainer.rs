@@ -226,7 +226,6 @@ impl Method for SplatTrainer {
             return Ok(());
         }
         self.abort_growth_search()?; // It is repeated with this keyframe.
-        self.trials.add_image();
         if keyframe.split == Split::Validation && self.trials.holds_validation() {
             self.trials.validation.push(ValidationImage { keyframe, image: None });
             self.update_growth_search();

@@ -332,11 +332,6 @@ impl SplatTrials {
         is_deferred
     }
 
-    /// Counts an image that arrives.
-    pub(crate) fn add_image(&mut self) {
-        self.doubling.iter_mut().for_each(Doubling::add_image);
-    }
-
     /// If growth depends on trials and many of the `n_images` images are new, restarts the search for the number of
     /// splats, and excludes validation keyframes that arrive from now on from training. Has no effect during a trial.
     pub(crate) fn restart_growth(&mut self, n_images: usize) {

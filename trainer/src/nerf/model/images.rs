@@ -168,6 +168,13 @@ impl NerfModel {
         }
     }
 
+    /// Restores the field before the running trial, which starts again at the next step.
+    pub(super) fn undo_trial(&mut self) -> Result<(), Error> {
+        let Some(RunningTrial { before, .. }) = self.trials.running.take() else { return Ok(()) };
+        self.n_discarded_steps += self.step - before.step;
+        self.restore(&before)
+    }
+
     /// Ends all trials. Needed when the field is recreated or loses an image, because snapshots then do not match it.
     pub(super) fn abort_trials(&mut self) -> Result<(), Error> {
         let Some(before) = self.trials.before() else { return Ok(()) };

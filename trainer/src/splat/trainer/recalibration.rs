@@ -5,6 +5,7 @@
 //! Coefficients of spherical harmonics are not rotated, because corrections are a few degrees at most.
 
 use super::SplatTrainer;
+use crate::aligned::replacement;
 use crate::gpu::{Gpu, f32s_of};
 use crate::splat::buffers::SplatBuffers;
 use crate::splat::camera_params::CameraParams;
@@ -14,7 +15,7 @@ use keyframe::{DepthMap, Keyframe};
 use kinematics::{Intrinsics, Lens, Transform};
 use nalgebra::{Point3, Quaternion, UnitQuaternion, Vector3};
 use rayon::prelude::*;
-use std::collections::{BTreeMap, HashMap};
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 /// Maximum number of keyframes that determine the motion of the splats, spread evenly over all.
@@ -39,16 +40,10 @@ impl Recalibrate for SplatTrainer {
         let gpu = self.recorder.gpu.clone();
         let motions = motions(keyframes, |camera| learned.get(camera));
         move_splats(&gpu, &self.model.splats, &motions)?;
-        let after: HashMap<_, _> =
-            keyframes.iter().map(|keyframe| (id_of(&keyframe.before), &keyframe.after)).collect();
-        let corrected = |keyframe: &mut Arc<Keyframe>| {
-            if let Some(after) = after.get(&id_of(keyframe)) {
-                *keyframe = Arc::clone(after);
-            }
-        };
+        let corrected = replacement(keyframes);
         self.recorder.passes.clear_bindings();
-        self.views.replace_cameras(&gpu, corrected);
-        self.seeding.replace_cameras(corrected, &self.views);
+        self.views.replace_cameras(&gpu, &corrected);
+        self.seeding.replace_cameras(&corrected, &self.views);
         self.trials.validation.iter_mut().for_each(|image| corrected(&mut image.keyframe));
         let mut params = self.model.cameras.set & IMAGE_PARAMS;
         if alignment.has_image_poses() && self.trials.remove_candidate(ParamSet::IMAGE_POSES) {
@@ -58,10 +53,6 @@ impl Recalibrate for SplatTrainer {
         self.schedule.extend_for_arrival();
         Ok(())
     }
-}
-
-fn id_of(keyframe: &Keyframe) -> (Arc<str>, i64) {
-    (keyframe.camera.clone(), keyframe.stamp.0)
 }
 
 /// A camera at its pose in the world.
