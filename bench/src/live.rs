@@ -278,7 +278,8 @@ pub fn findings(input: &str, runs: &[LiveRun]) -> Findings {
     }
     let head: Vec<String> =
         ["quantity".to_owned()].into_iter().chain(runs.iter().map(|run| run.conditions.to_string())).collect();
-    let mut tables = vec![Table { title: "Live run".to_owned(), head: head.clone(), rows }];
+    let mut tables =
+        vec![Table { title: "Live run (durations: median / 99th percentile)".to_owned(), head: head.clone(), rows }];
     let rows = OverTime::rows(&runs.iter().map(|run| &run.over_time).collect::<Vec<_>>());
     if !rows.is_empty() {
         tables.push(Table { title: "Second half of the run: median and change per hour".to_owned(), head, rows });

@@ -18,28 +18,32 @@ pub struct Repeating<Reopen> {
     offset_nanos: i64,
     /// The earliest and latest stamp of this round, without the offset.
     span: Option<[Stamp; 2]>,
+    /// Whether this round has an image. A recording without images is not repeated, because a run would never begin.
+    has_image: bool,
     n_restarts: u64,
 }
 
 impl<Reopen: FnMut() -> Result<Box<dyn Source>, Error> + Send> Repeating<Reopen> {
     /// Repeats `source`. `reopen` reopens it at its first sample.
     pub fn new(source: Box<dyn Source>, reopen: Reopen) -> Self {
-        Self { source, reopen, offset_nanos: 0, span: None, n_restarts: 0 }
+        Self { source, reopen, offset_nanos: 0, span: None, has_image: false, n_restarts: 0 }
     }
 }
 
 impl<Reopen: FnMut() -> Result<Box<dyn Source>, Error> + Send> Source for Repeating<Reopen> {
-    /// Returns `None` only if a round has no samples.
+    /// Returns `None` only if a round has no images.
     fn next_sample(&mut self) -> Result<Option<Sample>, Error> {
         loop {
             if let Some(mut sample) = self.source.next_sample()? {
                 let stamp = sample.stamp();
                 let [earliest, latest] = self.span.unwrap_or([stamp; 2]);
                 self.span = Some([earliest.min(stamp), latest.max(stamp)]);
+                self.has_image |= matches!(sample, Sample::Image(_));
                 sample.shift(self.offset_nanos);
                 return Ok(Some(sample));
             }
-            let Some([earliest, latest]) = self.span.take() else { return Ok(None) };
+            let Some([earliest, latest]) = self.span.take().filter(|_| self.has_image) else { return Ok(None) };
+            self.has_image = false;
             self.source = (self.reopen)()?;
             let round_nanos = latest.nanos_since(earliest).saturating_add(PAUSE_NANOS);
             self.offset_nanos = self.offset_nanos.saturating_add(round_nanos);
@@ -75,6 +79,18 @@ mod tests {
         Sample::Joints(JointState { stamp, position: vec![0.0], velocity: Vec::new(), effort: Vec::new() })
     }
 
+    fn image(nanos: i64) -> Image {
+        Image {
+            camera: "wrist".into(),
+            stamp: Stamp(nanos),
+            size_px: [1, 1],
+            format: PixelFormat::Rgb8,
+            data: [0; 3].into(),
+            exposure_secs: None,
+            n_skipped: 0,
+        }
+    }
+
     fn repeating(samples: Vec<Sample>) -> impl Source {
         let open = move || -> Result<Box<dyn Source>, Error> { Ok(Box::new(Scripted(samples.clone().into_iter()))) };
         Repeating::new(open().expect("scripted"), open)
@@ -82,15 +98,7 @@ mod tests {
 
     #[test]
     fn all_samples_are_shifted_by_the_length_of_earlier_rounds() {
-        let image = Image {
-            camera: "wrist".into(),
-            stamp: Stamp(40),
-            size_px: [1, 1],
-            format: PixelFormat::Rgb8,
-            data: [0; 3].into(),
-            exposure_secs: None,
-            n_skipped: 0,
-        };
+        let image = image(40);
         let truth = TruthImage {
             image: image.clone(),
             depth_m: [].into(),
@@ -114,10 +122,13 @@ mod tests {
     }
 
     #[test]
-    fn empty_sources_and_failures_end_the_repetition() {
+    fn sources_without_images_and_failures_end_the_repetition() {
         assert!(matches!(repeating(Vec::new()).next_sample(), Ok(None)));
+        let mut without_images = repeating(vec![joints(0)]);
+        assert!(matches!(without_images.next_sample(), Ok(Some(_))));
+        assert!(matches!(without_images.next_sample(), Ok(None)));
         let reopen = || Err(Error::Ended { camera: "wrist".to_owned() });
-        let mut failing = Repeating::new(Box::new(Scripted(vec![joints(0)].into_iter())), reopen);
+        let mut failing = Repeating::new(Box::new(Scripted(vec![Sample::Image(image(0))].into_iter())), reopen);
         assert!(matches!(failing.next_sample(), Ok(Some(_))));
         assert!(failing.next_sample().is_err());
     }

@@ -31,6 +31,12 @@ pub fn corrected(
             correct(camera, correction, &alignment.estimates, ALIGNED);
         }
         if let Some(correction) = learned.get(&*camera.name) {
+            log::info!(
+                "camera {:?}: corrected by {:.3} degrees and {:.2} mm, optimized with the scene",
+                &*camera.name,
+                Vector3::from(correction.rotation_rad).norm().to_degrees(),
+                1e3 * Vector3::from(correction.translation_m).norm()
+            );
             correct(camera, correction, &[], LEARNED);
         }
     }

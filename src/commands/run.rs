@@ -254,13 +254,32 @@ impl Running {
     }
 
     /// Closes the devices without saving anything.
-    pub(super) fn discard(self) -> anyhow::Result<InputResult> {
+    pub(super) fn discard(self) -> anyhow::Result<DiscardedRun> {
+        let is_interrupted = self.stop.signaled();
         self.stop.request();
+        let keyframes = self.live.keyframes();
+        let has_model = keyframes.iter().any(|keyframe| keyframe.split == Split::Train);
+        let n_keyframes = keyframes.len();
         let (mut sessions, input_result) = self.live.finish();
         // The caller may remove the folders, so checkpoints in progress must finish first.
         sessions.iter_mut().for_each(Session::wait_for_checkpoint);
-        Ok(input_result?)
+        let input_result = input_result?;
+        let counts = input_result.join.counts();
+        let mut data_losses = counts.data_losses(SampleUse::ProcessedOnly);
+        data_losses.extend(self.damage.get().cloned());
+        let no_model_reason = (!has_model).then(|| no_model_reason(n_keyframes, counts, &self.rig));
+        Ok(DiscardedRun { input_result, data_losses, no_model_reason, is_interrupted })
     }
+}
+
+/// What remains of a run that saves nothing.
+pub(super) struct DiscardedRun {
+    pub(super) input_result: InputResult,
+    pub(super) data_losses: Vec<String>,
+    /// Why there was nothing to train on.
+    pub(super) no_model_reason: Option<String>,
+    /// Whether a signal ended the run.
+    pub(super) is_interrupted: bool,
 }
 
 /// Opens the devices, the GPU and the page; continues the `previous` run if there is one.

@@ -2,8 +2,8 @@
 
 use super::run_flags;
 use super::runs_args::print_result;
-use crate::commands::run;
-use crate::exit::Exit;
+use crate::commands::run::{self, DiscardedRun};
+use crate::exit::{self, Exit, InsufficientData};
 use crate::print;
 use anyhow::Context;
 use bench::live::{Conditions, HandEyeError, InputCounts, LiveRun, findings};
@@ -41,7 +41,7 @@ pub(crate) struct Args {
     #[arg(long, value_name = "DEG,MM", value_parser = hand_eye_error)]
     hand_eye_error: Option<(f64, f64)>,
     /// Number of directions of the hand-eye error, one run each
-    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..=100))]
+    #[arg(long, value_name = "N", default_value_t = 1, requires = "hand_eye_error", value_parser = clap::value_parser!(u64).range(1..=100))]
     directions: u64,
     /// Folder for charts and numbers
     #[arg(long, value_name = "DIR", default_value = "bench-live")]
@@ -72,15 +72,22 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Exit> {
     std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
     let rig = args.rig.as_ref().map(|path| Rig::load(path, &[])).transpose()?;
     let rig = open::recording(&args.recording, rig, &[])?.rig;
-    let mut runs = Vec::new();
+    let (mut runs, mut data_losses) = (Vec::new(), Vec::new());
     for conditions in args.conditions() {
-        let run = args.measure(&rig, conditions)?;
+        let Some((run, losses)) = args.measure(&rig, conditions)? else {
+            log::warn!("interrupted: the results do not contain the run with {conditions}");
+            break;
+        };
+        data_losses.extend(losses.into_iter().filter(|loss| !data_losses.contains(loss)).collect::<Vec<_>>());
         if args.json {
             print::report_json(&serde_json::json!({ "event": "run", "run": run }))?;
         } else {
             print::report(describe(&run));
         }
         runs.push(run);
+    }
+    if runs.is_empty() {
+        anyhow::bail!("interrupted before the first run ended");
     }
     let [width, height] = args.size;
     let kind = if args.panorama { "panoramas" } else { "pictures" };
@@ -93,8 +100,10 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Exit> {
     }
     let findings = findings(&input, &runs);
     let page = findings.write(&args.out)?;
-    print_result(&BenchResult { findings, page, data_losses: Vec::new() }, args.json)?;
-    Ok(Exit::Done)
+    data_losses.iter().for_each(|loss| log::warn!("data loss: {loss}"));
+    let exit = exit::from_losses(&data_losses);
+    print_result(&BenchResult { findings, page, data_losses }, args.json)?;
+    Ok(exit)
 }
 
 fn describe(run: &LiveRun) -> String {
@@ -115,8 +124,9 @@ impl Args {
         right.chain(wrong).collect()
     }
 
-    /// Measures one run, then removes its folder.
-    fn measure(&self, rig: &Rig, conditions: Conditions) -> anyhow::Result<LiveRun> {
+    /// Measures one run, then removes its folder. Returns its measurements and data losses, or `None` if it was
+    /// interrupted.
+    fn measure(&self, rig: &Rig, conditions: Conditions) -> anyhow::Result<Option<(LiveRun, Vec<String>)>> {
         let folder = self.out.join(format!("run-{}", std::process::id()));
         std::fs::create_dir_all(&folder).with_context(|| format!("cannot create {}", folder.display()))?;
         let measured = self.measure_in(&folder, rig, conditions);
@@ -126,7 +136,12 @@ impl Args {
         measured
     }
 
-    fn measure_in(&self, folder: &Path, rig: &Rig, conditions: Conditions) -> anyhow::Result<LiveRun> {
+    fn measure_in(
+        &self,
+        folder: &Path,
+        rig: &Rig,
+        conditions: Conditions,
+    ) -> anyhow::Result<Option<(LiveRun, Vec<String>)>> {
         let mut rig = rig.clone();
         if let Some(error) = conditions.hand_eye_error {
             error.apply(&mut rig);
@@ -147,11 +162,13 @@ impl Args {
         }
         let measured = LiveRun::of(conditions, &running.live, &viewers, &timeline);
         drop(viewers);
-        let input_result = running.discard()?;
+        let DiscardedRun { input_result, data_losses, no_model_reason, is_interrupted } = running.discard()?;
         let input = InputCounts::of(&input_result);
-        match input_result.input_error {
-            Some(error) => Err(anyhow::Error::new(error).context("the recording cannot be read")),
-            None => Ok(LiveRun { input, ..measured }),
+        match (input_result.input_error, no_model_reason) {
+            _ if is_interrupted => Ok(None),
+            (Some(error), _) => Err(anyhow::Error::new(error).context("the recording cannot be read")),
+            (None, Some(reason)) => Err(InsufficientData(reason).into()),
+            (None, None) => Ok(Some((LiveRun { input, ..measured }, data_losses))),
         }
     }
 }

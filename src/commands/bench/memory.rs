@@ -105,7 +105,7 @@ fn measure(args: &Args, flags: &run::Args) -> anyhow::Result<(MemoryRun, Option<
         }
     }
     drop(viewers);
-    Ok((measured, running.discard()?.input_error))
+    Ok((measured, running.discard()?.input_result.input_error))
 }
 
 fn describe(sample: &Sample) -> String {
