@@ -3,8 +3,9 @@
 //! A [`CameraCorrection`] holds the estimated errors of one camera: extrinsics (hand-eye), time offset, intrinsics,
 //! joint offsets, and the pose, scale and timing of its depth camera. A [`ParamSet`] selects which of them are
 //! estimated. [`align`] estimates them by registering keyframes with depth, keeps those that improve validation images
-//! ([`Trial`]), and reports their uncertainty. [`AlignmentTask`] runs [`align`] in parallel with training.
-//! [`register_station`] estimates the pose of a mobile base at one station.
+//! ([`Trial`]), and reports their uncertainty. Without depth, it estimates extrinsics from matched features.
+//! [`AlignmentTask`] runs [`align`] in parallel with training. [`register_station`] estimates the pose of a mobile base
+//! at one station.
 //!
 //! ```
 //! use calibration::CameraCorrection;

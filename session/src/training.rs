@@ -110,6 +110,7 @@ pub fn model_specs(
         drifts: data.rig.as_ref().is_none_or(Rig::has_moving_base),
         // Depth rendered from reported camera poses contains no information about the true poses.
         depth: data.has_depth() && data.rendered_depth.as_ref().is_none_or(|rendered| rendered.n_images == 0),
+        color_only: !data.has_depth(),
         many_images_per_camera: data.keyframes.len() >= MIN_IMAGES_PER_CAMERA * n_cameras,
     };
     // On a CPU, no trials by default: each takes hundreds of additional steps, which take minutes.

@@ -84,7 +84,7 @@ impl Refine {
 /// Which calibration parameters are estimated, and how.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct RefineSettings {
-    /// By registering keyframes with depth.
+    /// By registering keyframes with depth, or from features of keyframes without depth.
     pub align: CameraRefinement,
     /// Jointly with the scene.
     pub with_scene: CameraRefinement,
@@ -99,6 +99,8 @@ pub struct AvailableData {
     pub drifts: bool,
     /// Whether keyframes have depth.
     pub depth: bool,
+    /// Whether no keyframe has any depth, including depth from range scanners and rendered depth.
+    pub color_only: bool,
     /// Whether cameras have at least 10 images on average. With fewer, the extrinsics of a camera are
     /// hardly different from the poses of its images.
     pub many_images_per_camera: bool,
@@ -132,7 +134,8 @@ impl TrainingOptions {
 
     /// Rejects flags that are invalid for any data, before the data is read.
     pub fn check_before_data(&self, kinds: &[ModelKind], joints: bool) -> Result<(), Error> {
-        let all_available = AvailableData { joints, drifts: true, depth: true, many_images_per_camera: true };
+        let all_available =
+            AvailableData { joints, drifts: true, depth: true, color_only: false, many_images_per_camera: true };
         self.check_for(kinds)?;
         self.refining(all_available, Refine::None)?;
         self.check_learned(kinds, all_available)
@@ -140,7 +143,10 @@ impl TrainingOptions {
 
     /// Rejects requested parameters that no scene model can estimate. The error lists the supported parameters.
     pub fn check_learned(&self, kinds: &[ModelKind], available: AvailableData) -> Result<(), Error> {
-        let can_align = |param: &Refine| available.depth && *param != Refine::ImageGains;
+        let can_align = |param: &Refine| match available.depth {
+            true => *param != Refine::ImageGains,
+            false => available.color_only && *param == Refine::Extrinsics,
+        };
         let can_learn = |param: &Refine| {
             let set = param_set(std::slice::from_ref(param));
             !set.is_empty() && kinds.iter().any(|kind| kind.entry().learnable.contains(set))
@@ -178,8 +184,9 @@ impl TrainingOptions {
         }
         let set = param_set(requested);
         if !available.depth {
+            let aligned = if available.color_only { set & ParamSet::EXTRINSICS } else { ParamSet::empty() };
             return Ok(RefineSettings {
-                align: CameraRefinement::default(),
+                align: CameraRefinement::Always(aligned),
                 with_scene: CameraRefinement::Always(set),
             });
         }
@@ -254,8 +261,9 @@ impl AvailableData {
     /// Candidates for trials, the most promising first. They are estimated by registration if there is depth, otherwise
     /// jointly with the scene.
     ///
-    /// Without depth, extrinsics are optimized from the first step on: their error is shared by all images, so it is
-    /// observable if the poses are right, and a trial of a few hundred steps is too short to correct it.
+    /// Without depth, extrinsics are estimated from features and then optimized with the scene from the first step on:
+    /// their error is shared by all images, so it is observable if the poses are right, and a trial of a few hundred steps
+    /// is too short to correct it.
     fn auto_settings(self) -> RefineSettings {
         let gains = ParamSet::IMAGE_GAINS;
         let poses = ParamSet::IMAGE_POSES;
@@ -265,8 +273,13 @@ impl AvailableData {
             Self { depth: false, many_images_per_camera: true, .. } => vec![gains, ParamSet::TIME_OFFSET],
             Self { depth: false, .. } => vec![gains, ParamSet::EXTRINSICS | ParamSet::TIME_OFFSET],
         };
+        let aligned = match self {
+            Self { depth: true, .. } => candidates(),
+            Self { color_only: true, many_images_per_camera: true, .. } => vec![ParamSet::EXTRINSICS],
+            _ => Vec::new(),
+        };
         RefineSettings {
-            align: CameraRefinement::Try(if self.depth { candidates() } else { Vec::new() }),
+            align: CameraRefinement::Try(aligned),
             with_scene: match self.many_images_per_camera && !self.depth {
                 true => CameraRefinement::AlwaysAndTry(ParamSet::EXTRINSICS, with_scene),
                 false => CameraRefinement::Try(with_scene),
@@ -283,11 +296,13 @@ mod tests {
         ModelKind::from_name(name).expect("registered")
     }
 
+    fn available(joints: bool, depth: bool) -> AvailableData {
+        AvailableData { joints, drifts: !joints, depth, color_only: !depth, many_images_per_camera: true }
+    }
+
     fn refining(requested: &[Refine], joints: bool, depth: bool) -> Result<RefineSettings, String> {
         let options = TrainingOptions { refine: requested.to_vec(), ..TrainingOptions::default() };
-        options
-            .refining(AvailableData { joints, drifts: !joints, depth, many_images_per_camera: true }, Refine::None)
-            .map_err(|error| error.to_string())
+        options.refining(available(joints, depth), Refine::None).map_err(|error| error.to_string())
     }
 
     #[test]
@@ -299,12 +314,15 @@ mod tests {
         let without = refining(&[Refine::Extrinsics], true, false).unwrap();
         assert_eq!(
             without,
-            RefineSettings { align: CameraRefinement::default(), with_scene: CameraRefinement::Always(extrinsics) }
+            RefineSettings {
+                align: CameraRefinement::Always(extrinsics),
+                with_scene: CameraRefinement::Always(extrinsics)
+            }
         );
 
         let candidates = |choice: CameraRefinement| choice.candidates().len();
         for (joints, depth, aligned, learned) in
-            [(true, true, 8, 1), (true, false, 0, 2), (false, true, 8, 2), (false, false, 0, 2)]
+            [(true, true, 8, 1), (true, false, 1, 2), (false, true, 8, 2), (false, false, 1, 2)]
         {
             let RefineSettings { align, with_scene } = refining(&[Refine::Auto], joints, depth).unwrap();
             assert_eq!(
@@ -319,7 +337,7 @@ mod tests {
             (true, true, true, ParamSet::empty()),
             (false, false, false, ParamSet::empty()),
         ] {
-            let available = AvailableData { joints, drifts: !joints, depth, many_images_per_camera };
+            let available = AvailableData { many_images_per_camera, ..available(joints, depth) };
             let options = TrainingOptions::default();
             assert_eq!(options.refining(available, Refine::Auto).unwrap().with_scene.always(), always);
             assert_eq!(options.refining_live(available, false).unwrap().with_scene, CameraRefinement::Always(always));
@@ -331,7 +349,7 @@ mod tests {
     fn unsupported_flags_are_rejected_for_each_method() {
         let options =
             TrainingOptions { max_splats: Some(5), refine: vec![Refine::ImageGains], ..TrainingOptions::default() };
-        let available = AvailableData { joints: true, drifts: false, depth: true, many_images_per_camera: true };
+        let available = available(true, true);
         let both = [kind("tsdf"), kind("splat")];
         assert!(options.check_for(&both).is_ok() && options.check_learned(&both, available).is_ok());
         let message = options.check_for(&[kind("tsdf"), kind("nerf")]).unwrap_err().to_string();

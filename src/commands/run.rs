@@ -301,7 +301,13 @@ pub(super) fn start(
     let kinds = methods_of(&rig)?;
     args.training.options().check_for(&kinds)?;
     let depth = rig.cameras.iter().any(|camera| camera.depth.is_some());
-    let available = AvailableData { joints: true, drifts: rig.has_moving_base(), depth, many_images_per_camera: true };
+    let available = AvailableData {
+        joints: true,
+        drifts: rig.has_moving_base(),
+        depth,
+        color_only: !depth && rig.scanners.is_empty(),
+        many_images_per_camera: true,
+    };
     let training = args.training.options();
     training.check_learned(&kinds, available)?;
     training.refining_live(available, true)?; // Invalid flags are rejected before the GPU is opened.

@@ -2,7 +2,8 @@
 //!
 //! Alignment runs in parallel with training, once or repeatedly as keyframes arrive. Its result is applied a fixed number
 //! of steps after it began, so that a seed gives one result; in real time, it is applied when the caller asks for it
-//! ([`Method::poll_alignment`]), so that training never waits. A result that changes the corrections replaces the
+//! ([`Method::poll_alignment`]), so that training never waits. Alignment from features, without depth, takes only
+//! seconds, so it precedes the first step if it runs once. A result that changes the corrections replaces the
 //! keyframes; the model moves along with them or restarts, see [`Recalibrate`].
 
 use crate::checkpoint::{Checkpoint, PendingCheckpoint};
@@ -331,6 +332,14 @@ impl<M: Recalibrate + 'static> Aligned<M> {
         }
     }
 
+    /// Whether alignment must end before the first step.
+    fn precedes_training(&self) -> bool {
+        self.timing == AlignTiming::Once
+            && self.model.progress().step == 0
+            && self.alignment_task.is_requested()
+            && self.original_keyframes.iter().all(|keyframe| keyframe.depth.is_none())
+    }
+
     /// Steps until the result of alignment is due.
     fn steps_to_alignment(&self) -> u64 {
         let step = self.model.progress().step;
@@ -373,6 +382,10 @@ impl<M: Recalibrate + 'static> Method for Aligned<M> {
     }
 
     fn step(&mut self, n: u64) -> Result<u64, Error> {
+        if self.precedes_training() {
+            self.begin_alignment();
+            self.finish_alignment()?;
+        }
         self.finish_alignment_when_due()?;
         let n_steps = self.model.step(n.min(self.steps_to_alignment()))?;
         if n_steps > 0 {
@@ -554,6 +567,7 @@ mod tests {
     use crate::mean_color::MeanColor;
     use crate::model_options::ModelOptions;
     use crate::nerf::{NerfBudget, NerfModel, NerfOptions};
+    use crate::splat::SplatTrainer;
     use crate::test_scenes as scenes;
     use crate::tsdf::TsdfModel;
     use calibration::ParamSet;
@@ -784,6 +798,26 @@ mod tests {
         });
         assert_eq!(ends[0], ends[1]);
         assert_eq!(uninterrupted.alignment().unwrap().movements.len(), 1);
+    }
+
+    #[test]
+    fn cameras_without_depth_are_corrected_before_the_first_step() {
+        let miscalibration = Miscalibration { extrinsics: wrong_extrinsics(), ..Miscalibration::none() };
+        let without_depth = |keyframe: &Arc<Keyframe>| Arc::new(Keyframe { depth: None, ..(**keyframe).clone() });
+        let keyframes: Vec<_> = capture(&miscalibration).iter().map(without_depth).collect();
+        let choice = CameraRefinement::Try(vec![ParamSet::EXTRINSICS]);
+        let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+        let splats = SplatTrainer::new(gpu, ModelOptions::default()).unwrap();
+        let mut model = Aligned::new(splats, choice, true, 4 * ALIGNMENT_STEP);
+        keyframes.iter().for_each(|keyframe| model.push(keyframe.clone()).unwrap());
+        assert!(model.alignment().is_none());
+        train(&mut model, 1);
+        let correction = model.alignment().unwrap().corrections["wrist"].clone();
+        let (degrees, mm) = remaining(&correction, &miscalibration.extrinsics);
+        assert!(degrees < 0.15 && mm < 4.0, "{degrees} degrees, {mm} mm");
+        assert_eq!(model.progress().step, 1, "no step was discarded");
+        let test = keyframes.iter().find(|keyframe| keyframe.split == Split::Test).unwrap();
+        assert_eq!(model.calibrated_camera(test).unwrap(), correction.apply(test));
     }
 
     #[test]

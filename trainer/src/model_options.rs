@@ -12,11 +12,12 @@ pub trait MethodOptions: Serialize + DeserializeOwned + Default {
     const METHOD: &'static str;
 }
 
-/// When the cameras of keyframes with depth are aligned.
+/// When the cameras of keyframes are aligned.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum AlignTiming {
-    /// Once, with the keyframes that are known at the first step. The result is applied a fixed number of steps later.
+    /// Once, with the keyframes that are known at the first step. The result is applied a fixed number of steps later, or
+    /// before the first step if no keyframe has depth.
     Once,
     /// Repeatedly as keyframes arrive. Results are applied a fixed number of steps later.
     Lockstep,
@@ -37,7 +38,8 @@ pub struct CommonOptions {
     pub n_planned_steps: u64,
     /// Camera parameters that are optimized with the scene.
     pub cameras: CameraRefinement,
-    /// Camera parameters that alignment estimates by registering keyframes that have depth.
+    /// Camera parameters that alignment estimates by registering keyframes that have depth, or from features of keyframes
+    /// without depth.
     pub align: CameraRefinement,
     /// When they are estimated.
     pub align_timing: AlignTiming,

@@ -134,4 +134,15 @@ impl Layout {
     pub(super) fn joints(&self) -> Option<usize> {
         self.joints
     }
+
+    /// The extrinsics of all cameras.
+    pub(super) fn extrinsics(n_cameras: usize) -> Self {
+        let parts = |camera| (0..6).map(move |part| CalibrationParam::Extrinsics(camera, part));
+        let offsets = |camera| CameraParamOffsets { extrinsics: Some(6 * camera), ..CameraParamOffsets::default() };
+        Self {
+            params: (0..n_cameras).flat_map(parts).collect(),
+            by_camera: (0..n_cameras).map(offsets).collect(),
+            joints: None,
+        }
+    }
 }

@@ -10,6 +10,7 @@
 //! threads.
 
 mod corrections;
+mod features;
 mod fit;
 mod layout;
 mod movement;
@@ -78,11 +79,15 @@ pub fn candidates() -> Vec<ParamSet> {
     ]
 }
 
-/// Estimates the requested parameters; `None` if the keyframes have no depth or too few of them overlap.
+/// Estimates the requested parameters; `None` if too few keyframes overlap. Without depth, only extrinsics are
+/// estimated, from matched features.
 ///
 /// Parameters are estimated from training keyframes and evaluated on validation keyframes; test keyframes are not
 /// used.
 pub fn align(keyframes: &[Arc<Keyframe>], choice: &CameraRefinement) -> Option<Alignment> {
+    if keyframes.iter().all(|keyframe| keyframe.depth.is_none()) {
+        return features::align(keyframes, choice);
+    }
     let scene = AlignmentScene::new(keyframes, includes_image_poses(choice))?;
     let uncorrected =
         CalibrationModel { set: ParamSet::empty(), fit: None, corrections: Corrections::none(scene.cameras.len()) };

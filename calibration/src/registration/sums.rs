@@ -71,6 +71,13 @@ pub(super) struct PairSums {
     depth: Vec<f64>,
 }
 
+impl PairSums {
+    /// Sums of residuals other than brightness and depth.
+    pub(super) fn new(params: Vec<usize>, information: DMatrix<f64>, gradient: DVector<f64>) -> Self {
+        Self { params, information, gradient, photo: Vec::new(), depth: Vec::new() }
+    }
+}
+
 /// Correspondences of the first image's samples in the second image, within the selected pixels.
 pub(super) fn correspondences(
     [i, j]: [Side<'_>; 2],

@@ -169,6 +169,9 @@ fn moved(motions: &[Motion], point: &Point3<f64>) -> Option<(Point3<f64>, UnitQu
 /// Moves the splats on the GPU.
 fn move_splats(gpu: &Gpu, splats: &SplatBuffers, motions: &[Motion]) -> Result<(), Error> {
     let n = splats.n_splats as usize;
+    if n == 0 {
+        return Ok(());
+    }
     let mut means: Vec<[f32; 4]> = gpu.read(&splats.means, n)?;
     let mut rotations_wxyz: Vec<[f32; 4]> = gpu.read(&splats.rotations, n)?;
     means.par_iter_mut().zip(&mut rotations_wxyz).for_each(|(mean, rotation_wxyz)| {

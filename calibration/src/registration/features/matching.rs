@@ -1,0 +1,139 @@
+//! Matches of corners between two images whose relative pose is approximately known.
+
+use super::feature_image::{Corner, DESCRIPTOR_LEN, Descriptor, FeatureImage};
+use kinematics::Transform;
+use nalgebra::{Matrix3, Vector2, Vector3};
+
+/// Minimum normalized cross-correlation of a match.
+const MIN_CORRELATION: f32 = 0.75;
+/// Maximum squared distance of the best match's descriptor, relative to that of the second best.
+const MAX_RATIO: f32 = 0.7;
+/// Candidates closer than this to the best match, in texels, do not count as second best.
+const SAME_CORNER_TEXELS: f64 = 3.0;
+/// Maximum difference of the levels of two corners.
+const MAX_LEVEL_DIFFERENCE: usize = 1;
+
+/// Two corners that show the same point.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Match {
+    /// Rays in the two images: x and y at a depth of 1.
+    pub(super) rays: [Vector2<f64>; 2],
+    /// Size of the larger corner's texels, radians.
+    pub(super) texel_rad: f64,
+}
+
+/// The essential matrix of a relative pose.
+pub(super) fn essential(to_from_from: &Transform) -> Matrix3<f64> {
+    to_from_from.translation.vector.cross_matrix() * to_from_from.rotation.to_rotation_matrix().matrix()
+}
+
+/// Matches corners of one image with those of another.
+///
+/// * `to_from_from`: approximate relative pose.
+/// * `tolerance_rad`: maximum distance of a match from its epipolar line.
+pub(super) fn matches(
+    from: &FeatureImage,
+    to: &FeatureImage,
+    to_from_from: &Transform,
+    tolerance_rad: f64,
+) -> Vec<Match> {
+    let rotation = to_from_from.rotation.to_rotation_matrix();
+    let essential = essential(to_from_from);
+    let descriptors: Vec<Option<Descriptor>> =
+        to.corners.iter().map(|corner| to.rotated_descriptor(corner, roll(rotation.matrix(), &corner.ray)?)).collect();
+    let mut best_of_to: Vec<(f32, usize)> = vec![(MIN_CORRELATION, usize::MAX); to.corners.len()];
+    let mut best_of_from: Vec<Option<usize>> = vec![None; from.corners.len()];
+    let mut candidates: Vec<(f32, usize)> = Vec::new();
+    for (ix, corner) in from.corners.iter().enumerate() {
+        let ray = corner.ray.push(1.0);
+        let band = Band::new(&essential, rotation * ray, to_from_from, &ray, tolerance_rad);
+        candidates.clear();
+        for other_ix in to.corners_of_levels(corner.level, MAX_LEVEL_DIFFERENCE) {
+            if !band.contains(&to.corners[other_ix].ray) {
+                continue;
+            }
+            let Some(descriptor) = &descriptors[other_ix] else { continue };
+            let correlation = dot(&from.descriptors[ix], descriptor);
+            candidates.push((correlation, other_ix));
+            if correlation > best_of_to[other_ix].0 {
+                best_of_to[other_ix] = (correlation, ix);
+            }
+        }
+        let Some(best) = candidates.iter().copied().max_by(|a, b| a.0.total_cmp(&b.0).then(b.1.cmp(&a.1))) else {
+            continue;
+        };
+        let best_corner = &to.corners[best.1];
+        let same_rad = SAME_CORNER_TEXELS * to.texel_rad(best_corner);
+        let is_distinct = |other: &Corner| (other.ray - best_corner.ray).norm() > same_rad;
+        let second = candidates.iter().filter(|(_, other)| is_distinct(&to.corners[*other]));
+        let second = second.map(|(correlation, _)| *correlation).fold(-1.0f32, f32::max);
+        if best.0 > MIN_CORRELATION && 1.0 - best.0 < MAX_RATIO * (1.0 - second) {
+            best_of_from[ix] = Some(best.1);
+        }
+    }
+    let mutual = |(ix, best): (usize, &Option<usize>)| {
+        let other = (*best)?;
+        let (one, other) = (best_of_to[other].1 == ix).then_some((&from.corners[ix], &to.corners[other]))?;
+        let texel_rad = from.texel_rad(one).max(to.texel_rad(other));
+        Some(Match { rays: [one.ray, other.ray], texel_rad })
+    };
+    best_of_from.iter().enumerate().filter_map(mutual).collect()
+}
+
+/// Cosine and sine of the angle from the axes of the second image at a ray to those of the first image.
+fn roll(to_from_from: &Matrix3<f64>, ray: &Vector2<f64>) -> Option<[f64; 2]> {
+    // The axes of the first image as seen in the second: derivatives of the projection.
+    let project = |axis: Vector3<f64>| axis.xy() - ray * axis.z;
+    let (x, y) = (project(to_from_from.column(0).into()), project(to_from_from.column(1).into()));
+    let sum = Vector2::new(x.x + y.y, x.y - y.x).try_normalize(1e-6)?;
+    Some(sum.into())
+}
+
+/// The area of an image in which the match of a corner is searched.
+struct Band {
+    /// Normal of the epipolar line and its offset: the distance from the line is `normal · ray + offset`.
+    normal: Vector2<f64>,
+    offset: f64,
+    /// Where a very distant point appears, and the unit direction in which it moves as it comes nearer.
+    from_infinity: Option<(Vector2<f64>, Vector2<f64>)>,
+    tolerance_rad: f64,
+}
+
+impl Band {
+    fn new(
+        essential: &Matrix3<f64>,
+        at_infinity: Vector3<f64>,
+        to_from_from: &Transform,
+        ray: &Vector3<f64>,
+        tolerance_rad: f64,
+    ) -> Self {
+        let line = essential * ray;
+        let scale = line.xy().norm().max(f64::MIN_POSITIVE);
+        let from_infinity = (at_infinity.z > 0.1).then(|| {
+            let position = at_infinity.xy() / at_infinity.z;
+            let translation = to_from_from.translation.vector;
+            let direction = (translation.xy() - position * translation.z).try_normalize(0.0);
+            (position, direction.unwrap_or_default())
+        });
+        Self { normal: line.xy() / scale, offset: line.z / scale, from_infinity, tolerance_rad }
+    }
+
+    fn contains(&self, ray: &Vector2<f64>) -> bool {
+        (self.normal.dot(ray) + self.offset).abs() < self.tolerance_rad
+            && self
+                .from_infinity
+                .is_none_or(|(position, direction)| (ray - position).dot(&direction) > -self.tolerance_rad)
+    }
+}
+
+/// Dot product in eight independent sums, which compilers turn into vector instructions.
+fn dot(a: &Descriptor, b: &Descriptor) -> f32 {
+    const LANES: usize = 8;
+    let mut sums = [0.0f32; LANES];
+    for begin in (0..DESCRIPTOR_LEN).step_by(LANES) {
+        for lane in 0..LANES {
+            sums[lane] += a[begin + lane] * b[begin + lane];
+        }
+    }
+    sums.iter().sum()
+}

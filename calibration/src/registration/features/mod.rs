@@ -1,0 +1,279 @@
+//! Estimates the extrinsics of cameras from color images alone: corners are matched between images, and each match must
+//! lie near its epipolar line, which follows from the poses of the two images.
+//!
+//! An error of the extrinsics moves the epipolar lines of image pairs with different relative rotations differently, so
+//! it is observable without knowing any depth. The search for matches uses the approximately known poses: it is limited
+//! to a band around the epipolar line, and patches are rotated by the relative rotation of the images. Matches are
+//! searched again in a narrower band after each estimate.
+
+mod epipolar;
+mod feature_image;
+mod image_pairs;
+mod matching;
+#[cfg(test)]
+mod tests;
+
+use super::corrections::Corrections;
+use super::fit::{Fit, INITIAL_NOISE};
+use super::layout::Layout;
+use super::pairs::Pair;
+use super::report::{self, Alignment};
+use super::solve::Solution;
+use super::{AlignmentScene, CalibrationModel, MAX_IMAGES, MIN_PAIRS};
+use crate::{CameraCorrection, CameraRefinement, Candidate, ParamSet, Trial, rigid_transform};
+use epipolar::PairMatches;
+use feature_image::FeatureImage;
+use keyframe::{Keyframe, Split};
+use kinematics::Transform;
+use kinematics::quantile::{Rank, quantile};
+use nalgebra::{DVector, Vector3};
+use rayon::prelude::*;
+use std::collections::BTreeSet;
+use std::sync::Arc;
+
+/// Typical errors relative to those of registration: registration starts from an approximate calibration, but without
+/// depth, transforms are often measured by hand.
+const SCALE: f64 = 2.0;
+
+/// Minimum gain in cross-validation, dB. Errors of single poses cause smaller gains, too.
+const MIN_GAIN_DB: f64 = 0.1;
+
+/// One round of matching.
+#[derive(Clone, Copy, Debug)]
+struct Round {
+    /// Largest expected error of the extrinsics.
+    rotation_rad: f64,
+    translation_m: f64,
+    /// Number of partners of each image.
+    n_partners: usize,
+}
+
+/// Rounds of matching. A few pairs are enough for the coarse ones.
+const ROUNDS: [Round; 4] = [
+    Round { rotation_rad: 0.105, translation_m: 0.03, n_partners: 4 },
+    Round { rotation_rad: 0.05, translation_m: 0.02, n_partners: 4 },
+    Round { rotation_rad: 0.02, translation_m: 0.01, n_partners: 6 },
+    LAST_ROUND,
+];
+const LAST_ROUND: Round = Round { rotation_rad: 0.01, translation_m: 0.004, n_partners: 12 };
+/// Number of groups of images for cross-validation, and number of partners of each image.
+const N_FOLDS: usize = 4;
+const CROSS_VALIDATION_PARTNERS: usize = 8;
+/// Largest displacement along the epipolar line, in units of the focal length, for which the search band is wide enough.
+const MAX_PARALLAX: f64 = 0.5;
+/// Minimum half width of the band, texels of the finest level.
+const MIN_BAND_TEXELS: f64 = 4.0;
+/// Noise that cross-validation assumes, so that differences below it do not count.
+const NOISE_TEXELS: f64 = 0.5;
+/// Minimum number of matches of a pair.
+const MIN_MATCHES: usize = 8;
+/// Limits of the standard deviation of the distances from the epipolar lines, texels.
+const MIN_NOISE_TEXELS: f64 = 0.25;
+const MAX_NOISE_TEXELS: f64 = 1.5;
+/// The standard deviation that an iteration assumes, relative to the previous iteration.
+const ANNEALING: f64 = 0.75;
+const MAX_ITERATIONS: usize = 40;
+/// A step smaller than this number of standard deviations ends a round.
+const CONVERGED_STEP_SIGMAS: f64 = 0.05;
+/// Minimum fraction of the last round's matches within this fraction of the band around the epipolar line. Random
+/// matches are spread evenly over the band.
+const MIN_INNER_MATCHES: f64 = 0.5;
+const MAX_INNER_FRAC: f64 = 0.25;
+
+/// Images with corners.
+struct FeatureScene {
+    images: Vec<FeatureImage>,
+    cameras: Vec<Arc<str>>,
+    layout: Layout,
+}
+
+/// Estimates extrinsics from color if they are requested; `None` if too few images overlap or have corners.
+///
+/// Extrinsics are estimated from training and validation keyframes and evaluated by cross-validation; test keyframes are
+/// not used.
+pub(super) fn align(keyframes: &[Arc<Keyframe>], choice: &CameraRefinement) -> Option<Alignment> {
+    let includes_extrinsics = |set: &ParamSet| set.contains(ParamSet::EXTRINSICS);
+    if !includes_extrinsics(&choice.always()) && !choice.candidates().iter().any(includes_extrinsics) {
+        return None;
+    }
+    let scene = FeatureScene::new(keyframes);
+    let (pairs, fit) = scene.estimate()?;
+    let mut trial = scene.cross_validate(&fit.corrections);
+    let corrections = fit.corrections.clone();
+    let variant = CalibrationModel { set: ParamSet::EXTRINSICS, fit: Some(fit), corrections };
+    trial.kept &= trial.gain_db > MIN_GAIN_DB && variant.has_significant(&scene.layout);
+    let is_kept = trial.kept || matches!(choice, CameraRefinement::Always(_));
+    let summary = AlignmentScene {
+        images: Vec::new(),
+        cameras: scene.cameras.clone(),
+        pairs,
+        all_pairs: Vec::new(),
+        validation_pairs: Vec::new(),
+    };
+    let unobservable = variant.fit.iter().flat_map(|fit| report::unobservable(&summary, fit)).collect();
+    let kept = match is_kept {
+        true => variant,
+        false => CalibrationModel { set: ParamSet::empty(), fit: None, corrections: scene.uncorrected() },
+    };
+    Some(report::alignment(&summary, &kept, vec![trial], unobservable))
+}
+
+impl FeatureScene {
+    fn new(keyframes: &[Arc<Keyframe>]) -> Self {
+        let used: Vec<_> = keyframes.iter().filter(|keyframe| keyframe.split != Split::Test).collect();
+        let n = used.len().min(MAX_IMAGES);
+        let used: Vec<_> = (0..n).map(|ix| used[ix * used.len() / n]).collect();
+        let names: BTreeSet<Arc<str>> = used.iter().map(|keyframe| keyframe.camera.clone()).collect();
+        let cameras: Vec<Arc<str>> = names.into_iter().collect();
+        let camera_of = |keyframe: &Keyframe| cameras.partition_point(|name| *name < keyframe.camera);
+        let images = used.par_iter().map(|keyframe| FeatureImage::new(keyframe, camera_of(keyframe))).collect();
+        Self { images, layout: Layout::extrinsics(cameras.len()), cameras }
+    }
+
+    fn uncorrected(&self) -> Corrections {
+        Corrections::none(self.cameras.len())
+    }
+
+    /// Corrected poses of the images.
+    fn poses(&self, corrections: &Corrections) -> Vec<Transform> {
+        let camera_from_corrected: Vec<Transform> = corrections
+            .by_camera
+            .iter()
+            .map(|correction| {
+                rigid_transform(correction.rotation_rad.into(), correction.translation_m.into()).inverse()
+            })
+            .collect();
+        self.images.iter().map(|image| image.keyframe.world_from_camera * camera_from_corrected[image.camera]).collect()
+    }
+
+    /// Half the width of the search band of a pair, radians.
+    fn band_rad(&self, pair: &Pair, to_from_from: &Transform, round: &Round) -> f64 {
+        let (from, to) = (&self.images[pair.from], &self.images[pair.to]);
+        // An error that both images share cancels unless they are rotated relative to each other.
+        let share = match from.camera == to.camera {
+            true => 2.0 * (0.5 * to_from_from.rotation.angle()).sin(),
+            false => std::f64::consts::SQRT_2,
+        };
+        let baseline_m = to_from_from.translation.vector.norm();
+        let direction_rad = round.rotation_rad + share * round.translation_m / baseline_m;
+        let expected_rad = share * round.rotation_rad + MAX_PARALLAX * direction_rad;
+        expected_rad.max(MIN_BAND_TEXELS * from.finest_texel_rad().max(to.finest_texel_rad()))
+    }
+
+    /// Matches pairs of images near their epipolar lines. Pairs with few matches are dropped.
+    fn matches(&self, corrections: &Corrections, round: &Round) -> Vec<PairMatches> {
+        let poses = self.poses(corrections);
+        let of_pair = |pair: Pair| {
+            let to_from_from = poses[pair.to].inverse() * poses[pair.from];
+            let band_rad = self.band_rad(&pair, &to_from_from, round);
+            let (from, to) = (&self.images[pair.from], &self.images[pair.to]);
+            let matches = matching::matches(from, to, &to_from_from, band_rad);
+            (matches.len() >= MIN_MATCHES).then_some(PairMatches {
+                pair,
+                cameras: [from.camera, to.camera],
+                matches,
+                band_rad,
+            })
+        };
+        image_pairs::choose(&self.images, &poses, round.n_partners).into_par_iter().filter_map(of_pair).collect()
+    }
+
+    /// Estimates the extrinsics in rounds of matching, and returns the pairs of the last round. `None` without
+    /// consistent matches.
+    fn estimate(&self) -> Option<(Vec<Pair>, Fit)> {
+        let mut corrections = self.uncorrected();
+        let mut last = None;
+        for round in &ROUNDS {
+            let matches = self.matches(&corrections, round);
+            if matches.len() < MIN_PAIRS {
+                return None;
+            }
+            let fit = self.fit(&matches, &corrections)?;
+            corrections = fit.corrections.clone();
+            last = Some((matches, fit));
+        }
+        let (matches, fit) = last?;
+        let poses = self.poses(&corrections);
+        let is_inner = |pair: &PairMatches, distance: &f64| distance.abs() < MAX_INNER_FRAC * pair.band_rad;
+        let of_pair = |pair: &PairMatches| {
+            let distances = pair.distances_rad(&poses);
+            (distances.iter().filter(|distance| is_inner(pair, distance)).count(), distances.len())
+        };
+        let (n_inner, n) = matches.iter().map(of_pair).fold((0, 0), |all, pair| (all.0 + pair.0, all.1 + pair.1));
+        log::debug!("features: {n_inner} of {n} matches are consistent");
+        let is_consistent = n_inner as f64 > MIN_INNER_MATCHES * n as f64;
+        is_consistent.then(|| (matches.iter().map(|pair| pair.pair).collect(), fit))
+    }
+
+    /// Minimizes the distances of given matches, with decreasing influence of distant ones.
+    fn fit(&self, matches: &[PairMatches], start: &Corrections) -> Option<Fit> {
+        let pairs: Vec<Pair> = matches.iter().map(|pair| pair.pair).collect();
+        let mut corrections = start.clone();
+        let mut assumed_noise: Option<f64> = None;
+        let mut last = None;
+        for _ in 0..MAX_ITERATIONS {
+            let poses = self.poses(&corrections);
+            let mut distances: Vec<f64> = matches.iter().flat_map(|pair| pair.distances_texels(&poses)).collect();
+            distances.iter_mut().for_each(|distance| *distance = distance.abs());
+            let measured = 1.4826 * quantile(&mut distances, 0.5, Rank::Upper)?;
+            let target = measured.clamp(MIN_NOISE_TEXELS, MAX_NOISE_TEXELS);
+            let noise_texels = assumed_noise.map_or(measured, |assumed| ANNEALING * assumed).max(target);
+            assumed_noise = Some(noise_texels);
+            let sums: Vec<_> = matches.par_iter().map(|pair| pair.sums(&poses, &self.layout, noise_texels)).collect();
+            let scales = self.layout.params.iter().map(|param| SCALE * param.scale());
+            let values = self.layout.params.iter().map(|param| corrections.value(*param));
+            let [scales, values] = [scales.collect::<Vec<f64>>(), values.collect()].map(DVector::from);
+            let solution = Solution::new(scales, &values, &pairs, &sums);
+            corrections.apply_step(&self.layout, &solution.step);
+            let is_converged = noise_texels <= target && solution.step_in_sigmas() < CONVERGED_STEP_SIGMAS;
+            log::debug!(
+                "features: {} matches, noise {noise_texels:.2} texels, step of {:.2} sigma",
+                distances.len(),
+                solution.step_in_sigmas()
+            );
+            last = Some(solution);
+            if is_converged {
+                break;
+            }
+        }
+        Some(Fit { corrections, layout: self.layout.clone(), solution: last?, noise: INITIAL_NOISE })
+    }
+
+    /// Evaluates by cross-validation how much closer to their epipolar lines matches are with corrections: corrections
+    /// are estimated without one group of images, and applied to the matches of this group.
+    fn cross_validate(&self, corrections: &Corrections) -> Trial {
+        // The band around the given epipolar lines also contains the estimated ones.
+        let largest = |part: fn(&CameraCorrection) -> [f64; 3]| {
+            let norm = |correction| Vector3::from(part(correction)).norm();
+            corrections.by_camera.iter().map(norm).fold(0.0, f64::max)
+        };
+        let round = Round {
+            rotation_rad: LAST_ROUND.rotation_rad + largest(|correction| correction.rotation_rad),
+            translation_m: LAST_ROUND.translation_m + largest(|correction| correction.translation_m),
+            n_partners: CROSS_VALIDATION_PARTNERS,
+        };
+        let matches = self.matches(&self.uncorrected(), &round);
+        let baseline = self.poses(&self.uncorrected());
+        let of_fold = |fold: usize| {
+            let is_held_out = |image: usize| image % N_FOLDS == fold;
+            let (tested, used): (Vec<PairMatches>, Vec<PairMatches>) =
+                matches.iter().cloned().partition(|pair| is_held_out(pair.pair.from) || is_held_out(pair.pair.to));
+            let variant = self.fit(&used, corrections).map(|fit| self.poses(&fit.corrections));
+            let gain_db = |image: usize| {
+                let variant = variant.as_ref()?;
+                let pairs = tested.iter().filter(|pair| pair.pair.from == image || pair.pair.to == image);
+                let gains = pairs.flat_map(|pair| {
+                    let distances = pair.distances_texels(&baseline).into_iter().zip(pair.distances_texels(variant));
+                    distances
+                        .map(|(before, after)| 20.0 * (NOISE_TEXELS.hypot(before) / NOISE_TEXELS.hypot(after)).log10())
+                });
+                let gains: Vec<f64> = gains.collect();
+                (!gains.is_empty()).then(|| gains.iter().sum::<f64>() / gains.len() as f64)
+            };
+            (0..self.images.len()).filter(|image| is_held_out(*image)).filter_map(gain_db).collect::<Vec<f64>>()
+        };
+        let gains_db: Vec<f64> = (0..N_FOLDS).into_par_iter().flat_map_iter(of_fold).collect();
+        log::debug!("features: gains {gains_db:.2?} dB");
+        Trial::of_gains(Candidate::Cameras(ParamSet::EXTRINSICS), &gains_db).with_enough_images()
+    }
+}

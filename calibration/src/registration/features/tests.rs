@@ -1,0 +1,109 @@
+use super::*;
+use crate::scenes::{Miscalibration, capture, remaining, wrong_extrinsics};
+use kinematics::random::Random;
+
+const EXTRINSICS: ParamSet = ParamSet::EXTRINSICS;
+
+/// A scan of the room without depth.
+fn scan(miscalibration: &Miscalibration) -> Vec<Arc<Keyframe>> {
+    let without_depth = |keyframe: &Arc<Keyframe>| Arc::new(Keyframe { depth: None, ..(**keyframe).clone() });
+    capture(miscalibration).iter().map(without_depth).collect()
+}
+
+fn with_extrinsics(extrinsics: Transform) -> Miscalibration {
+    Miscalibration { extrinsics, ..Miscalibration::none() }
+}
+
+/// An extrinsics error of 3 degrees and 15 mm.
+fn large_error() -> Transform {
+    Transform::new(Vector3::new(0.009, -0.009, 0.008), Vector3::new(0.03, 0.03, -0.03))
+}
+
+fn try_extrinsics() -> CameraRefinement {
+    CameraRefinement::AlwaysAndTry(EXTRINSICS, Vec::new())
+}
+
+#[test]
+fn hidden_errors_are_found_with_any_number_of_threads() {
+    for error in [wrong_extrinsics(), large_error()] {
+        let keyframes = scan(&with_extrinsics(error));
+        let with_threads = |n: usize| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(n).build().unwrap();
+            pool.install(|| crate::align(&keyframes, &try_extrinsics())).unwrap()
+        };
+        let alignment = with_threads(1);
+        assert!(alignment.trials[0].kept && alignment.trials[0].gain_db > 1.0, "{:?}", alignment.trials);
+        assert!(matches!(&alignment.estimates[..], [report::Estimate::HandEye(_)]), "{:?}", alignment.estimates);
+        let (degrees, mm) = remaining(&alignment.corrections["wrist"], &error);
+        assert!(degrees < 0.15 && mm < 4.0, "{degrees} degrees, {mm} mm");
+        assert_eq!(alignment, with_threads(3));
+    }
+}
+
+#[test]
+fn each_camera_has_its_own_error() {
+    let errors = [wrong_extrinsics(), large_error()];
+    let scans = errors.map(|error| scan(&with_extrinsics(error)));
+    let image = |ix: usize| {
+        let keyframe = &scans[ix % 2][ix];
+        // Both cameras have test and validation images.
+        let split = Split::of(ix / 2);
+        Arc::new(Keyframe { camera: ["left", "right"][ix % 2].into(), split, ..(**keyframe).clone() })
+    };
+    let keyframes: Vec<_> = (0..scans[0].len()).map(image).collect();
+    let alignment = crate::align(&keyframes, &try_extrinsics()).unwrap();
+    for (camera, error) in ["left", "right"].into_iter().zip(errors) {
+        let (degrees, mm) = remaining(&alignment.corrections[camera], &error);
+        assert!(degrees < 0.2 && mm < 5.0, "{camera}: {degrees} degrees, {mm} mm");
+    }
+}
+
+#[test]
+fn right_extrinsics_are_not_changed() {
+    let alignment = crate::align(&scan(&Miscalibration::none()), &try_extrinsics()).unwrap();
+    assert!(!alignment.has_corrections() && !alignment.trials[0].kept, "{:?}", alignment.trials);
+}
+
+#[test]
+fn images_without_common_texture_give_no_result() {
+    let keyframes = scan(&with_extrinsics(large_error()));
+    let with_pixels = |pixel: &dyn Fn(&mut Random) -> u8| -> Vec<Arc<Keyframe>> {
+        let image = |(ix, keyframe): (usize, &Arc<Keyframe>)| {
+            let mut random = Random::new(ix as u64);
+            let pixels = 0..keyframe.rgba_srgb.len() / 4;
+            let rgba = pixels.flat_map(|_| [[pixel(&mut random); 3].as_slice(), &[255]].concat()).collect();
+            Arc::new(Keyframe { rgba_srgb: rgba, ..(**keyframe).clone() })
+        };
+        keyframes.iter().enumerate().map(image).collect()
+    };
+    let flat = with_pixels(&|random| 128 + random.byte() % 4);
+    let noise = with_pixels(&|random| random.byte());
+    let tiny = |keyframe: &Arc<Keyframe>| {
+        Arc::new(Keyframe { size_px: [2, 1], rgba_srgb: [255; 8].into(), ..(**keyframe).clone() })
+    };
+    let tiny = keyframes.iter().map(tiny).collect();
+    for keyframes in [&flat, &noise, &tiny, &keyframes[..4].to_vec()] {
+        for choice in [CameraRefinement::Always(EXTRINSICS), try_extrinsics()] {
+            assert_eq!(crate::align(keyframes, &choice), None);
+        }
+    }
+}
+
+#[test]
+fn unobservable_translations_stay_at_zero() {
+    let error = Transform::new(Vector3::new(0.009, -0.009, 0.008), Vector3::zeros());
+    let keyframes = scan(&Miscalibration { azimuth_only: true, ..with_extrinsics(error) });
+    let alignment = crate::align(&keyframes, &CameraRefinement::Always(EXTRINSICS)).unwrap();
+    assert!(!alignment.unobservable.is_empty());
+    let correction = &alignment.corrections["wrist"];
+    assert!(Vector3::from(correction.translation_m).norm() < 0.005, "{correction:?}");
+    assert!(Vector3::from(correction.rotation_rad).norm() < 0.02, "{correction:?}");
+}
+
+#[test]
+fn only_requested_extrinsics_are_estimated() {
+    let keyframes = scan(&with_extrinsics(large_error()));
+    for choice in [CameraRefinement::Always(ParamSet::LENS), CameraRefinement::Try(vec![ParamSet::TIME_OFFSET])] {
+        assert_eq!(crate::align(&keyframes, &choice), None);
+    }
+}
