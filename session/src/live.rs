@@ -13,6 +13,8 @@ use std::time::{Duration, Instant};
 use trainer::{AlignTiming, QueuedPicture};
 use viz::{Hub, KeyframePose, ModelStatus, PendingRender, Status};
 
+/// Minimum number of keyframes that determine the first view of the scene.
+const HINT_KEYFRAMES: usize = 5;
 /// Period of status messages.
 const PUBLISH_PERIOD: Duration = Duration::from_millis(250);
 /// Maximum wait for a keyframe when there is nothing to do.
@@ -241,7 +243,7 @@ impl Live {
         }
         if self.keyframes.len() != n_before {
             self.publish_keyframes();
-            if self.keyframes.len() <= self.start_keyframes
+            if self.keyframes.len() <= self.start_keyframes.max(HINT_KEYFRAMES)
                 && let Some(hint) = scene_hint::from_keyframes(&self.keyframes)
             {
                 self.hub.set_scene_hint(hint);

@@ -409,7 +409,8 @@ pub(super) fn start(
         }
         sessions.push(session);
     }
-    let options = LiveOptions { pace, start_keyframes: rig.join.start_keyframes, notes, open_gpu };
+    let start_keyframes = rig.join.start_keyframes_or_default(pace == Pace::RealTime, depth);
+    let options = LiveOptions { pace, start_keyframes, notes, open_gpu };
 
     let held = sessions.first().map_or(Vec::new(), |session| session.keyframes().to_vec());
     let live = Live::new(sessions, feed, hub, options).resume_from(held);

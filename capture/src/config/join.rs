@@ -6,8 +6,8 @@ keys! {
     /// Which images become keyframes, and how many are kept.
     #[derive(Clone, Debug, PartialEq)]
     pub struct JoinConfig {
-        /// Number of keyframes with which training starts.
-        pub start_keyframes: usize = 5, in 1..=100_000;
+        /// Number of keyframes with which training starts; `None` for [`Self::start_keyframes_or_default`].
+        pub start_keyframes: Option<usize>, in 1..=100_000;
         /// Maximum number of keyframes in the store.
         pub max_keyframes: usize = 400, in 8..=1_000_000;
         /// Maximum host memory of the keyframes in the store, bytes.
@@ -41,5 +41,13 @@ keys! {
         pub max_wait_millis: f64 = 500.0, in 1.0..=60_000.0;
         /// Maximum number of range scans kept beside the keyframes.
         pub max_range_scans: usize = 200, in 0..=1_000_000;
+    }
+}
+
+impl JoinConfig {
+    /// Number of keyframes with which training starts. By default, a run in real time starts with the first keyframe if
+    /// there is depth, which shows where surfaces are. Other runs wait for five keyframes.
+    pub fn start_keyframes_or_default(&self, is_real_time: bool, has_depth: bool) -> usize {
+        self.start_keyframes.unwrap_or(if is_real_time && has_depth { 1 } else { 5 })
     }
 }
