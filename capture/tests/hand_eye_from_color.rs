@@ -1,5 +1,4 @@
 //! Estimates a hand-eye transform from the color images of a real arm. Skipped without the test data.
-#![expect(clippy::unwrap_used, reason = "a test that cannot continue may panic")]
 
 #[path = "../../tests/common/test_data.rs"]
 mod test_data;
