@@ -324,9 +324,12 @@ fn documented_defaults_match_the_code() {
     for line in page.lines().filter(|line| line.starts_with("| `join.") || line.starts_with("| `camera.NAME.sim.")) {
         let cells: Vec<&str> = line.split('|').map(str::trim).collect();
         let key = cells[1].trim_matches('`').replace("NAME", "wrist");
-        let value = key.split('.').fold(&Value::Table(resolved.clone()), |table, part| &table[part]).clone();
-        let number = value.as_float().or_else(|| value.as_integer().map(|whole| whole as f64)).expect("a number");
-        assert_eq!(cells[3].parse::<f64>().expect("a number in the documentation"), number, "{key}");
+        let resolved = Value::Table(resolved.clone());
+        let value = key.split('.').try_fold(&resolved, |table, part| table.get(part));
+        // A default that depends on the run is described in words, and is not in the resolved file.
+        let number = value
+            .map(|value| value.as_float().or_else(|| value.as_integer().map(|whole| whole as f64)).expect("a number"));
+        assert_eq!(cells[3].parse::<f64>().ok(), number, "{key}");
         n_checked += 1;
     }
     assert_eq!(n_checked, 26, "[join] and [camera.NAME.sim]");
