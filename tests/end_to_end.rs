@@ -587,10 +587,10 @@ fn hand_eye_error(folder: &Path, file: &str) -> (f64, f64) {
 }
 
 #[test]
-fn without_depth_the_hand_eye_calibration_is_optimized_with_the_scene() {
+fn without_depth_the_hand_eye_calibration_is_estimated_from_color() {
     const N_IMAGES: i64 = 90;
-    const MAX_REMAINING_DEGREES: f64 = 0.6;
-    const MAX_REMAINING_MM: f64 = 5.0;
+    const MAX_REMAINING_DEGREES: f64 = 0.2;
+    const MAX_REMAINING_MM: f64 = 1.5;
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
     record_with_wrong_hand_eye(folder, N_IMAGES, |wrist| drop(wrist.remove("depth")));
@@ -608,7 +608,10 @@ fn without_depth_the_hand_eye_calibration_is_optimized_with_the_scene() {
         let report: Value = serde_json::from_str(&report).expect("JSON");
         let rotation_rad: Vec<f64> =
             serde_json::from_value(report["cameras"]["wrist"]["rotation_rad"].clone()).expect("numbers");
-        assert!(report["alignment"].is_null() && rotation_rad.iter().any(|part| part.abs() > 1e-3), "{rotation_rad:?}");
+        assert!(
+            report["alignment"].is_object() && rotation_rad.iter().any(|part| part.abs() > 1e-3),
+            "{rotation_rad:?}"
+        );
     }
 }
 

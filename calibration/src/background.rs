@@ -95,6 +95,9 @@ impl AlignmentTask {
             log::info!("{line}");
         }
         let Some(mut result) = result else { return Ok(false) };
+        if self.result.as_ref().is_some_and(|latest| is_as_good(latest, &result, keyframes)) {
+            return Ok(false);
+        }
         if let Some(latest) = &self.result {
             result.movements.clone_from(&latest.movements);
         }
@@ -126,6 +129,24 @@ impl AlignmentTask {
             None => Alignment::default().camera(keyframe, learned),
         }
     }
+}
+
+/// Accuracy of extrinsics that were estimated from color: 0.1 degrees and 3 mm.
+const COLOR_ACCURACY_RAD: f64 = 1.75e-3;
+const COLOR_ACCURACY_M: f64 = 3e-3;
+
+/// Whether the latest corrections are as good as newer ones. Without depth, they are if both agree within their accuracy,
+/// or if the newer estimate was rejected; cameras would move back and forth otherwise.
+fn is_as_good(latest: &Alignment, newer: &Alignment, keyframes: &[Arc<Keyframe>]) -> bool {
+    if !latest.has_corrections() || keyframes.iter().any(|keyframe| keyframe.depth.is_some()) {
+        return false;
+    }
+    let agrees = |keyframe: &Arc<Keyframe>| {
+        let [latest, newer] = [latest, newer].map(|alignment| alignment.camera(keyframe, None).world_from_camera);
+        let motion = latest.inverse() * newer;
+        motion.rotation.angle() < COLOR_ACCURACY_RAD && motion.translation.vector.norm() < COLOR_ACCURACY_M
+    };
+    !newer.has_corrections() || keyframes.iter().all(agrees)
 }
 
 /// Detects camera movements in the background. Its keyframes already have the corrections of alignment.

@@ -13,8 +13,8 @@ use std::path::{Path, PathBuf};
 const ALIGNED: &str = "registration of keyframes";
 const LEARNED: &str = "optimization with the scene";
 
-/// The rig with the corrections of alignment, followed by those optimized with the scene. Corrections of single images
-/// have no key in a rig file and are left out.
+/// The rig with the corrections of alignment, followed by those optimized with the scene; of these, extrinsics are left
+/// out if alignment has estimated them. Corrections of single images have no key in a rig file and are left out, too.
 pub fn corrected(
     rig: &Rig,
     alignment: Option<&Alignment>,
@@ -31,13 +31,20 @@ pub fn corrected(
             correct(camera, correction, &alignment.estimates, ALIGNED);
         }
         if let Some(correction) = learned.get(&*camera.name) {
-            log::info!(
-                "camera {:?}: corrected by {:.3} degrees and {:.2} mm, optimized with the scene",
-                &*camera.name,
-                Vector3::from(correction.rotation_rad).norm().to_degrees(),
-                1e3 * Vector3::from(correction.translation_m).norm()
-            );
-            correct(camera, correction, &[], LEARNED);
+            let mut correction = correction.clone();
+            let registered = alignment.corrections.get(&*camera.name);
+            if registered.is_some_and(|registered| registered.rotation_rad != [0.0; 3]) {
+                // Registration is more accurate: extrinsics that are optimized with an unfinished scene adapt to it.
+                (correction.rotation_rad, correction.translation_m) = ([0.0; 3], [0.0; 3]);
+            } else if correction.rotation_rad != [0.0; 3] {
+                log::info!(
+                    "camera {:?}: corrected by {:.3} degrees and {:.2} mm, optimized with the scene",
+                    &*camera.name,
+                    Vector3::from(correction.rotation_rad).norm().to_degrees(),
+                    1e3 * Vector3::from(correction.translation_m).norm()
+                );
+            }
+            correct(camera, &correction, &[], LEARNED);
         }
     }
     let joint_offsets =

@@ -127,7 +127,7 @@ impl MovementDetector {
     /// Tests the next keyframe, which has the same corrections as the references. Returns a movement if one is
     /// detected; create a new detector afterwards. The movement applies to the corrected keyframes.
     pub fn push(&mut self, keyframe: &Arc<Keyframe>) -> Option<CameraMovement> {
-        let image = PreparedImage::new(keyframe, 0).filter(|_| is_used(keyframe))?;
+        let image = is_used(keyframe).then(|| PreparedImage::new(keyframe, 0)).flatten()?;
         self.add(image, Judgment { stake: 1.0, ..Judgment::default() });
         let ix = self.images.len() - 1;
         let pairs = pairs::choose(&self.images, &self.views, &self.references(), &[ix], MAX_PARTNERS);

@@ -28,12 +28,15 @@ use kinematics::Transform;
 use kinematics::quantile::{Rank, quantile};
 use nalgebra::{DVector, Vector3};
 use rayon::prelude::*;
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 /// Typical errors relative to those of registration: registration starts from an approximate calibration, but without
 /// depth, transforms are often measured by hand.
 const SCALE: f64 = 2.0;
+
+/// Cameras with fewer training and validation images keep the given extrinsics.
+const MIN_IMAGES_PER_CAMERA: usize = 10;
 
 /// Minimum gain in cross-validation, dB. Errors of single poses cause smaller gains, too.
 const MIN_GAIN_DB: f64 = 0.1;
@@ -120,11 +123,22 @@ pub(super) fn align(keyframes: &[Arc<Keyframe>], choice: &CameraRefinement) -> O
 
 impl FeatureScene {
     fn new(keyframes: &[Arc<Keyframe>]) -> Self {
-        let used: Vec<_> = keyframes.iter().filter(|keyframe| keyframe.split != Split::Test).collect();
-        let n = used.len().min(MAX_IMAGES);
-        let used: Vec<_> = (0..n).map(|ix| used[ix * used.len() / n]).collect();
-        let names: BTreeSet<Arc<str>> = used.iter().map(|keyframe| keyframe.camera.clone()).collect();
-        let cameras: Vec<Arc<str>> = names.into_iter().collect();
+        let mut ixs_of_camera = BTreeMap::<Arc<str>, Vec<usize>>::new();
+        for (ix, keyframe) in keyframes.iter().enumerate() {
+            // Evicted keyframes have no pixels after recovery.
+            if keyframe.split != Split::Test && !keyframe.rgba_srgb.is_empty() {
+                ixs_of_camera.entry(keyframe.camera.clone()).or_default().push(ix);
+            }
+        }
+        ixs_of_camera.retain(|_, ixs| ixs.len() >= MIN_IMAGES_PER_CAMERA);
+        let max_images = (MAX_IMAGES / ixs_of_camera.len().max(1)).max(MIN_IMAGES_PER_CAMERA);
+        let sampled = ixs_of_camera.values().flat_map(|ixs| {
+            let n = ixs.len().min(max_images);
+            (0..n).map(move |ix| ixs[ix * ixs.len() / n])
+        });
+        let used: BTreeSet<usize> = sampled.collect();
+        let used: Vec<_> = used.into_iter().map(|ix| &keyframes[ix]).collect();
+        let cameras: Vec<Arc<str>> = ixs_of_camera.into_keys().collect();
         let camera_of = |keyframe: &Keyframe| cameras.partition_point(|name| *name < keyframe.camera);
         let images = used.par_iter().map(|keyframe| FeatureImage::new(keyframe, camera_of(keyframe))).collect();
         Self { images, layout: Layout::extrinsics(cameras.len()), cameras }
