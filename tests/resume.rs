@@ -209,7 +209,7 @@ fn killed_live_run_resumes_keyframes_and_clock() {
     let checkpoint = Checkpoint::read(&file).unwrap();
     let n_stored = || std::fs::read_dir(folder.join("out/keyframes")).unwrap().count();
     let n_stored_at_kill = n_stored();
-    assert!(n_stored_at_kill > 4 && !checkpoint.is_finished, "{n_stored_at_kill} keyframes");
+    assert!(n_stored_at_kill > 1 && !checkpoint.is_finished, "{n_stored_at_kill} keyframes");
 
     let output = run(&["--resume", "out"]).output().unwrap();
     let stderr_text = String::from_utf8_lossy(&output.stderr);
