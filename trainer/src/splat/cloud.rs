@@ -60,8 +60,8 @@ fn random_color(random: &mut Random) -> [[f32; 3]; N_COEFFICIENTS] {
 /// give equal splats.
 ///
 /// Most splats are flat and lie on an uneven wall around z = 0, whose edges lie outside an image with a focal length of
-/// 0.9 image widths. [`PATCH_FRAC`] of them are smaller and lie in a few [`PATCHES`], where the lists of the tiles are
-/// several times longer. [`LARGE_FRAC`] of them are large, and [`N_HUGE`] cover the whole image.
+/// 0.9 image widths. `PATCH_FRAC` of them are smaller and lie in a few `PATCHES`, where the lists of the tiles are
+/// several times longer. `LARGE_FRAC` of them are large, and `N_HUGE` cover the whole image.
 #[expect(clippy::cast_possible_truncation, reason = "drawn in f64, used in f32")]
 pub fn scan_cloud(n_splats: usize, seed: u64) -> SplatArrays {
     let mut random = Random::new(seed);
