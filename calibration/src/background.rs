@@ -124,10 +124,7 @@ impl AlignmentTask {
     /// The camera of a keyframe with the corrections of alignment, followed by the corrections that were learned with
     /// the splats.
     pub fn calibrated_camera(&self, keyframe: &Keyframe, learned: Option<&CameraCorrection>) -> CalibratedCamera {
-        match &self.result {
-            Some(alignment) => alignment.camera(keyframe, learned),
-            None => Alignment::default().camera(keyframe, learned),
-        }
+        self.result.as_ref().unwrap_or(&Alignment::default()).camera(keyframe, learned)
     }
 }
 
@@ -190,12 +187,12 @@ impl MovementTask {
                 busy => return self.worker = busy,
             };
         let keyframes = std::mem::take(&mut self.pending);
-        let judge = move || {
+        let test = move || {
             let mut detector = detector();
             let movement = keyframes.iter().find_map(|keyframe| detector.push(keyframe));
             (detector, movement)
         };
-        self.worker = Worker::Running(std::thread::spawn(|| run_in_background_pool(judge)));
+        self.worker = Worker::Running(std::thread::spawn(|| run_in_background_pool(test)));
     }
 
     /// Returns a movement if one was found. With `wait`, tests all keyframes first.

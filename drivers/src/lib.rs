@@ -38,6 +38,8 @@ mod reconnecting;
 pub mod recording;
 mod repeating;
 mod sample;
+#[cfg(test)]
+mod scripted;
 pub mod tags;
 #[cfg(test)]
 #[path = "../../tests/common/test_data.rs"]

@@ -99,16 +99,7 @@ impl Source for Playback {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{Image, PixelFormat};
-    use kinematics::JointState;
-
-    struct Scripted(std::vec::IntoIter<Sample>);
-
-    impl Source for Scripted {
-        fn next_sample(&mut self) -> Result<Option<Sample>, Error> {
-            Ok(self.0.next())
-        }
-    }
+    use crate::scripted::{self, Scripted, joints};
 
     fn millis(millis: i64) -> Stamp {
         // Stamps of another computer.
@@ -116,17 +107,11 @@ mod tests {
     }
 
     fn image(stamp: Stamp) -> Sample {
-        let data = [0; 3].into();
-        let (camera, format) = ("wrist".into(), PixelFormat::Rgb8);
-        Sample::Image(Image { camera, stamp, size_px: [1, 1], format, data, exposure_secs: None, n_skipped: 0 })
-    }
-
-    fn joints(stamp: Stamp) -> Sample {
-        Sample::Joints(JointState { stamp, position: vec![0.0], velocity: Vec::new(), effort: Vec::new() })
+        Sample::Image(scripted::image(stamp))
     }
 
     fn playback(samples: Vec<Sample>) -> Playback {
-        Playback::new(Box::new(Scripted(samples.into_iter())))
+        Playback::new(Box::new(Scripted::new(samples)))
     }
 
     #[test]

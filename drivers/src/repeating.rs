@@ -63,42 +63,18 @@ impl<Reopen: FnMut() -> Result<Box<dyn Source>, Error> + Send> Source for Repeat
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{Image, PixelFormat, RangeScan, TruthImage};
-    use kinematics::{JointState, Transform};
-
-    struct Scripted(std::vec::IntoIter<Sample>);
-
-    impl Source for Scripted {
-        fn next_sample(&mut self) -> Result<Option<Sample>, Error> {
-            Ok(self.0.next())
-        }
-    }
-
-    fn joints(nanos: i64) -> Sample {
-        let stamp = Stamp(nanos);
-        Sample::Joints(JointState { stamp, position: vec![0.0], velocity: Vec::new(), effort: Vec::new() })
-    }
-
-    fn image(nanos: i64) -> Image {
-        Image {
-            camera: "wrist".into(),
-            stamp: Stamp(nanos),
-            size_px: [1, 1],
-            format: PixelFormat::Rgb8,
-            data: [0; 3].into(),
-            exposure_secs: None,
-            n_skipped: 0,
-        }
-    }
+    use crate::scripted::{Scripted, image, joints};
+    use crate::{RangeScan, TruthImage};
+    use kinematics::Transform;
 
     fn repeating(samples: Vec<Sample>) -> impl Source {
-        let open = move || -> Result<Box<dyn Source>, Error> { Ok(Box::new(Scripted(samples.clone().into_iter()))) };
+        let open = move || -> Result<Box<dyn Source>, Error> { Ok(Box::new(Scripted::new(samples.clone()))) };
         Repeating::new(open().expect("scripted"), open)
     }
 
     #[test]
     fn all_samples_are_shifted_by_the_length_of_earlier_rounds() {
-        let image = image(40);
+        let image = image(Stamp(40));
         let truth = TruthImage {
             image: image.clone(),
             depth_m: [].into(),
@@ -107,7 +83,13 @@ mod tests {
         };
         let scan = RangeScan { scanner: "lidar".into(), stamp: Stamp(90), points: [].into() };
         // The image arrives after a joint state with a later stamp.
-        let round = vec![joints(50), Sample::Image(image), Sample::Truth(truth), Sample::Range(scan), joints(100)];
+        let round = vec![
+            joints(Stamp(50)),
+            Sample::Image(image),
+            Sample::Truth(truth),
+            Sample::Range(scan),
+            joints(Stamp(100)),
+        ];
         let mut source = repeating(round);
         let mut stamps = Vec::new();
         for n_restarts in 0..3 {
@@ -124,11 +106,11 @@ mod tests {
     #[test]
     fn sources_without_images_and_failures_end_the_repetition() {
         assert!(matches!(repeating(Vec::new()).next_sample(), Ok(None)));
-        let mut without_images = repeating(vec![joints(0)]);
+        let mut without_images = repeating(vec![joints(Stamp(0))]);
         assert!(matches!(without_images.next_sample(), Ok(Some(_))));
         assert!(matches!(without_images.next_sample(), Ok(None)));
         let reopen = || Err(Error::Ended { camera: "wrist".to_owned() });
-        let mut failing = Repeating::new(Box::new(Scripted(vec![Sample::Image(image(0))].into_iter())), reopen);
+        let mut failing = Repeating::new(Box::new(Scripted::new(vec![Sample::Image(image(Stamp(0)))])), reopen);
         assert!(matches!(failing.next_sample(), Ok(Some(_))));
         assert!(failing.next_sample().is_err());
     }

@@ -32,8 +32,11 @@ pub fn corrected(
         }
         if let Some(correction) = learned.get(&*camera.name) {
             let mut correction = correction.clone();
-            let registered = alignment.corrections.get(&*camera.name);
-            if registered.is_some_and(|registered| registered.rotation_rad != [0.0; 3]) {
+            let is_of_camera = |estimate: &Estimate| match estimate {
+                Estimate::HandEye(estimate) => *estimate.camera == *camera.name,
+                _ => false,
+            };
+            if alignment.estimates.iter().any(is_of_camera) {
                 // Registration is more accurate: extrinsics that are optimized with an unfinished scene adapt to it.
                 (correction.rotation_rad, correction.translation_m) = ([0.0; 3], [0.0; 3]);
             } else if correction.rotation_rad != [0.0; 3] {

@@ -292,10 +292,7 @@ impl Session {
     /// Camera of a keyframe with the corrections of alignment and those that [`Self::refresh_corrections`] has read.
     pub fn camera_of(&self, keyframe: &Keyframe) -> CalibratedCamera {
         let learned = self.learned.get(&*keyframe.camera);
-        match self.method.alignment() {
-            Some(alignment) => alignment.camera(keyframe, learned),
-            None => Alignment::default().camera(keyframe, learned),
-        }
+        self.method.alignment().unwrap_or(&Alignment::default()).camera(keyframe, learned)
     }
 
     /// Reads the corrections that are optimized with the scene, for [`Self::camera_of`]. Waits for queued work.

@@ -194,7 +194,14 @@ impl<M: Recalibrate + 'static> Aligned<M> {
         let (model, untrained) = resume(&own_checkpoint, &corrected)?;
         let originals: BTreeMap<_, _> = keyframes.iter().map(|keyframe| (id_of(keyframe), keyframe)).collect();
         let original = |id: (&str, i64)| originals.get(&id).map(|keyframe| Arc::clone(keyframe));
-        let original_keyframes = ids.iter().filter_map(|(camera, nanos)| original((camera, *nanos))).collect();
+        let mut original_keyframes: Vec<_> =
+            ids.iter().filter_map(|(camera, nanos)| original((camera, *nanos))).collect();
+        // After recovery, evicted keyframes have no pixels. They are removed from the model, too.
+        let has_pixels = |keyframe: &Arc<Keyframe>| !keyframe.rgba_srgb.is_empty();
+        let n_with_pixels =
+            |n: usize| original_keyframes.iter().take(n).filter(|keyframe| has_pixels(keyframe)).count();
+        let [n_begun, n_references] = [n_begun, n_references].map(|n| n.map(n_with_pixels));
+        original_keyframes.retain(has_pixels);
         // Uncorrected, because `push` corrects them.
         let untrained = untrained.iter().filter_map(|keyframe| original(id_of(keyframe))).collect();
         let mut aligned = Self {
@@ -798,6 +805,17 @@ mod tests {
         });
         assert_eq!(ends[0], ends[1]);
         assert_eq!(uninterrupted.alignment().unwrap().movements.len(), 1);
+
+        // After recovery, a reference and a later keyframe that were evicted have no pixels.
+        let evicted = [2, N_FIRST + 2];
+        let mut restored = keyframes[..n_before].to_vec();
+        for ix in evicted {
+            restored[ix] = Arc::new(Keyframe { rgba_srgb: [].into(), ..restored[ix].as_ref().clone() });
+        }
+        let (mut recovered, _) = Aligned::resume(&checkpoint, &restored, resume).unwrap();
+        evicted.iter().for_each(|ix| recovered.remove("wrist", keyframes[*ix].stamp).unwrap());
+        train_on(&mut *recovered, &keyframes[n_before..]);
+        assert_eq!(recovered.alignment().unwrap().movements.len(), 1);
     }
 
     #[test]

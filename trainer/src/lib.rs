@@ -55,6 +55,6 @@ pub use failed_model::FailedModel;
 pub use method::{Method, Progress};
 pub use model_options::{AlignTiming, CommonOptions, MethodOptions, ModelOptions};
 pub use model_spec::{LoadedModel, ModelSpec, Resumed, load, resume};
-pub use packing::{PackedDepth, PackedPicture, Packing, QueuedPicture, Rendered};
+pub use packing::{JPEG_QUALITY, PackedDepth, PackedPicture, Packing, QueuedPicture, Rendered};
 pub use registry::ModelKind;
 pub use request::{Aabb, Picture, Projection, RenderRequest};

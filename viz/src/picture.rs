@@ -6,10 +6,8 @@ use crate::protocol::{BinaryHeader, ColorPart, DepthFormat, DepthPart, LiveHeade
 use crate::updates::{LiveImage, LivePixels};
 use crate::view_request::ViewRequest;
 use std::time::Instant;
-use trainer::{PackedDepth, Packing, Picture, Rendered};
+use trainer::{JPEG_QUALITY, PackedDepth, Packing, Picture, Rendered};
 
-/// JPEG quality of the last stage. It gives no visible blocks on textures.
-const QUALITY_LAST: u8 = 92;
 /// JPEG quality of intermediate stages and live images, which are soon replaced.
 const QUALITY_INTERMEDIATE: u8 = 80;
 /// Smaller pictures keep full color resolution, because halving it saves little and the page enlarges these pictures.
@@ -34,7 +32,7 @@ pub(crate) enum PackError {
 
 /// How a stage is packed on the GPU; `None` if the client requests another format.
 pub(crate) fn packing(view_request: &ViewRequest, is_last: bool) -> Option<Packing> {
-    let quality = if is_last { QUALITY_LAST } else { QUALITY_INTERMEDIATE };
+    let quality = if is_last { JPEG_QUALITY } else { QUALITY_INTERMEDIATE };
     let packing = Packing { jpeg_quality: view_request.color.then_some(quality), depth: view_request.depth.is_some() };
     (view_request.depth != Some(DepthFormat::F32)).then_some(packing)
 }
@@ -86,7 +84,7 @@ fn encode_picture(
 fn pack_color(picture: &Picture, is_last: bool) -> Result<Vec<u8>, JpegError> {
     let pixels = Pixels { size_px: picture.size_px, layout: Layout::Rgba, bytes: &picture.rgba_srgb };
     let is_small = picture.rgba_srgb.len() < 4 * MIN_HALVED_PX;
-    let quality = if is_last { QUALITY_LAST } else { QUALITY_INTERMEDIATE };
+    let quality = if is_last { JPEG_QUALITY } else { QUALITY_INTERMEDIATE };
     encode(&pixels, quality, if is_last || is_small { Chroma::Full } else { Chroma::Halved })
 }
 

@@ -128,11 +128,8 @@ struct CalibrationModel {
 
 impl AlignmentScene {
     fn new(keyframes: &[Arc<Keyframe>], for_poses: bool) -> Option<Self> {
-        let used: Vec<&Arc<Keyframe>> = keyframes
-            .iter()
-            .filter(|keyframe| keyframe.split != Split::Test && keyframe.depth.is_some())
-            .filter(|keyframe| !keyframe.rgba_srgb.is_empty()) // Evicted keyframes have no pixels after recovery.
-            .collect();
+        let used: Vec<&Arc<Keyframe>> =
+            keyframes.iter().filter(|keyframe| keyframe.split != Split::Test && keyframe.depth.is_some()).collect();
         let names: BTreeSet<Arc<str>> = used.iter().map(|keyframe| keyframe.camera.clone()).collect();
         let cameras: Vec<Arc<str>> = names.into_iter().collect();
         let camera_of = |keyframe: &Keyframe| cameras.partition_point(|name| *name < keyframe.camera);

@@ -93,7 +93,7 @@ impl std::fmt::Display for CameraMovement {
 
 /// An image in the detector.
 #[derive(Debug, Default)]
-struct Judgment {
+struct ImageState {
     is_reference: bool,
     /// Individual motion of the camera relative to the reference images (meters, then radians) and its information;
     /// `None` if the image and the references show no common surfaces.
@@ -107,7 +107,7 @@ struct Judgment {
 pub struct MovementDetector {
     images: Vec<PreparedImage>,
     views: Vec<CorrectedView>,
-    judgments: Vec<Judgment>,
+    states: Vec<ImageState>,
 }
 
 impl MovementDetector {
@@ -117,9 +117,9 @@ impl MovementDetector {
         let n = used.len().min(MAX_REFERENCES);
         let images: Vec<_> =
             (0..n).into_par_iter().filter_map(|ix| PreparedImage::new(used[ix * used.len() / n], 0)).collect();
-        let mut detector = Self { images: Vec::new(), views: Vec::new(), judgments: Vec::new() };
+        let mut detector = Self { images: Vec::new(), views: Vec::new(), states: Vec::new() };
         for image in images {
-            detector.add(image, Judgment { is_reference: true, ..Judgment::default() });
+            detector.add(image, ImageState { is_reference: true, ..ImageState::default() });
         }
         detector
     }
@@ -128,43 +128,43 @@ impl MovementDetector {
     /// detected; create a new detector afterwards. The movement applies to the corrected keyframes.
     pub fn push(&mut self, keyframe: &Arc<Keyframe>) -> Option<CameraMovement> {
         let image = is_used(keyframe).then(|| PreparedImage::new(keyframe, 0)).flatten()?;
-        self.add(image, Judgment { stake: 1.0, ..Judgment::default() });
+        self.add(image, ImageState { stake: 1.0, ..ImageState::default() });
         let ix = self.images.len() - 1;
         let pairs = pairs::choose(&self.images, &self.views, &self.references(), &[ix], MAX_PARTNERS);
         let recent = self.recent(&keyframe.camera);
         if pairs.len() >= MIN_PARTNERS {
             self.bet(ix, &pairs, &recent);
         }
-        let sum = recent.iter().map(|ix| self.judgments[*ix].stake).sum::<f64>();
+        let sum = recent.iter().map(|ix| self.states[*ix].stake).sum::<f64>();
         log::debug!("movement of camera {:?}: sum of stakes {sum:.3e}", keyframe.camera);
         if sum >= ALARM {
             if let Some(movement) = self.movement(&recent) {
                 return Some(movement);
             }
-            recent.iter().for_each(|ix| self.judgments[*ix].stake = 1.0);
+            recent.iter().for_each(|ix| self.states[*ix].stake = 1.0);
         }
         if recent.len() > MOVEMENT_WINDOW {
-            self.judgments[recent[0]] = Judgment { is_reference: true, ..Judgment::default() };
+            self.states[recent[0]] = ImageState { is_reference: true, ..ImageState::default() };
         }
         self.thin_references();
         None
     }
 
-    fn add(&mut self, image: PreparedImage, judgment: Judgment) {
+    fn add(&mut self, image: PreparedImage, state: ImageState) {
         if let Some(view) = CorrectedView::new(&image, &CameraCorrection::default(), &Layout::default()) {
             self.images.push(image);
             self.views.push(view);
-            self.judgments.push(judgment);
+            self.states.push(state);
         }
     }
 
     fn references(&self) -> Vec<usize> {
-        (0..self.images.len()).filter(|ix| self.judgments[*ix].is_reference).collect()
+        (0..self.images.len()).filter(|ix| self.states[*ix].is_reference).collect()
     }
 
     /// The images of a camera that are not references, in order of arrival.
     fn recent(&self, camera: &str) -> Vec<usize> {
-        let is_recent = |ix: &usize| !self.judgments[*ix].is_reference && *self.images[*ix].keyframe.camera == *camera;
+        let is_recent = |ix: &usize| !self.states[*ix].is_reference && *self.images[*ix].keyframe.camera == *camera;
         (0..self.images.len()).filter(is_recent).collect()
     }
 
@@ -174,9 +174,9 @@ impl MovementDetector {
         for (position, start) in recent.iter().enumerate().filter(|(_, start)| **start != ix) {
             let Some(motion) = self.mean_motion(&recent[position..]) else { continue };
             let Some(gain_db) = self.gain_db(pairs, noise, &motion) else { continue };
-            self.judgments[*start].stake *= factor(gain_db);
+            self.states[*start].stake *= factor(gain_db);
         }
-        self.judgments[ix].motion = self.own_motion(ix, pairs);
+        self.states[ix].motion = self.own_motion(ix, pairs);
     }
 
     fn noise(&self, pairs: &[Pair]) -> Option<Noise> {
@@ -203,7 +203,7 @@ impl MovementDetector {
     /// Mean of the motions of several images, weighted by their information.
     fn mean_motion(&self, ixs: &[usize]) -> Option<Vector6<f64>> {
         let (mut information, mut weighted) = (Matrix6::zeros(), Vector6::zeros());
-        for (motion, weight) in ixs.iter().filter_map(|ix| self.judgments[*ix].motion.as_ref()) {
+        for (motion, weight) in ixs.iter().filter_map(|ix| self.states[*ix].motion.as_ref()) {
             information += weight;
             weighted += weight * motion;
         }
@@ -214,7 +214,7 @@ impl MovementDetector {
     fn explained_frac(&self, ixs: &[usize]) -> Option<f64> {
         let mean = self.mean_motion(ixs)?;
         let squares = |motion: &dyn Fn(&Vector6<f64>) -> Vector6<f64>| {
-            let motions = ixs.iter().filter_map(|ix| self.judgments[*ix].motion.as_ref());
+            let motions = ixs.iter().filter_map(|ix| self.states[*ix].motion.as_ref());
             motions.map(|(own, weight)| motion(own).dot(&(weight * motion(own)))).sum::<f64>()
         };
         Some(1.0 - squares(&|own| own - mean) / squares(&|own| *own))
@@ -230,7 +230,7 @@ impl MovementDetector {
 
     /// The movement that explains the recent images of a camera; `None` if it is too small or explains too little.
     fn movement(&mut self, recent: &[usize]) -> Option<CameraMovement> {
-        let stake = |position: &usize| self.judgments[recent[*position]].stake;
+        let stake = |position: &usize| self.states[recent[*position]].stake;
         let start = (0..recent.len()).max_by(|one, other| stake(one).total_cmp(&stake(other)))?;
         let motion = self.mean_motion(&recent[start..])?;
         // The first image from which on the motion improves predictions the most.
@@ -288,14 +288,13 @@ impl MovementDetector {
         for ix in references.into_iter().skip(1).step_by(2).rev() {
             self.images.remove(ix);
             self.views.remove(ix);
-            self.judgments.remove(ix);
+            self.states.remove(ix);
         }
     }
 }
 
 fn is_used(keyframe: &Keyframe) -> bool {
-    // Evicted keyframes have no pixels after recovery.
-    keyframe.split != Split::Test && keyframe.depth.is_some() && !keyframe.rgba_srgb.is_empty()
+    keyframe.split != Split::Test && keyframe.depth.is_some()
 }
 
 fn finest(noise: Noise) -> ResidualOptions {
@@ -408,7 +407,7 @@ mod tests {
                 };
                 assert_eq!(detector.push(&Arc::new(later)), None);
                 assert!(detector.images.len() <= MAX_REFERENCES + MOVEMENT_WINDOW + 1);
-                assert_eq!(detector.images.len(), detector.judgments.len());
+                assert_eq!(detector.images.len(), detector.states.len());
             }
         }
         assert!(detector.references().len() >= MAX_REFERENCES / 2);

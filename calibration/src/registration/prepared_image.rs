@@ -188,13 +188,11 @@ pub(super) fn depth_at(depth: &DepthMap, pixel: [f64; 2]) -> Option<SampledValue
     Some(SampledValue { value: z, gradient: gradient.map(|gradient| -gradient * z * z) })
 }
 
-fn levels(keyframe: &Keyframe) -> Vec<GrayImage> {
+/// Size and mean brightness (0 to 255) of squares of `edge` pixels; NaN in masked areas.
+pub(super) fn brightness(keyframe: &Keyframe, edge: usize) -> ([usize; 2], Vec<f32>) {
     let [width, height] = keyframe.size_px.map(|side| side as usize);
-    let level_shift = keyframe.size_px[0].div_ceil(MAX_COLUMNS).next_power_of_two().ilog2();
-    let edge = 1usize << level_shift;
     let size = [width / edge, height / edge];
-    let mut values = vec![0.0f32; size[0] * size[1]];
-    for (ix, value) in values.iter_mut().enumerate() {
+    let mean = |ix: usize| {
         let (x, y) = (ix % size[0], ix / size[0]);
         let (mut sum, mut is_valid) = (0u32, true);
         for row in y * edge..(y + 1) * edge {
@@ -204,10 +202,16 @@ fn levels(keyframe: &Keyframe) -> Vec<GrayImage> {
                 sum += 77 * u32::from(pixel[0]) + 150 * u32::from(pixel[1]) + 29 * u32::from(pixel[2]);
             }
         }
-        *value = if is_valid { sum as f32 / (256 * edge * edge) as f32 } else { f32::NAN };
-    }
+        if is_valid { sum as f32 / (256 * edge * edge) as f32 } else { f32::NAN }
+    };
+    (size, (0..size[0] * size[1]).map(mean).collect())
+}
+
+fn levels(keyframe: &Keyframe) -> Vec<GrayImage> {
+    let level_shift = keyframe.size_px[0].div_ceil(MAX_COLUMNS).next_power_of_two().ilog2();
+    let edge = 1usize << level_shift;
+    let (mut size, mut values) = brightness(keyframe, edge);
     let mut levels = vec![GrayImage::new(size, edge as f64, &values)];
-    let mut size = size;
     while levels.len() < MAX_LEVELS && size[0].min(size[1]) / 2 >= MIN_SIDE {
         let half = [size[0] / 2, size[1] / 2];
         let finer = |x: usize, y: usize| values[y * size[0] + x];

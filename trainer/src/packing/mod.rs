@@ -16,6 +16,9 @@ const WORDS_PER_MCU: u32 = 16;
 /// Words before the coded words.
 const HEADER_WORDS: u32 = 4;
 
+/// JPEG quality of complete pictures for viewers. It gives no visible blocks on textures.
+pub const JPEG_QUALITY: u8 = 92;
+
 /// How a drawn picture is read back.
 #[derive(Clone, Copy, Debug)]
 pub(crate) enum Output {

@@ -13,7 +13,7 @@ use super::params::{Camera, LOW_PASS_PX2, Rule, Supervision, status};
 use super::passes::{Target, ViewPasses};
 use super::work_counts::WorkCounts;
 use crate::gpu::{Buffer, Gpu, PassTiming, Passes, f32_of};
-use crate::packing::LazyPacker;
+use crate::packing::{JPEG_QUALITY, LazyPacker};
 use crate::{Error, Packing};
 use kinematics::Transform;
 use kinematics::quantile::{Rank, quantile};
@@ -22,8 +22,6 @@ use std::cell::RefCell;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-/// Quality of the JPEG files that viewers get.
-const JPEG_QUALITY: u8 = 92;
 /// Learning rate of every parameter. It is small, so that the cloud hardly changes.
 const RATE: f32 = 1e-5;
 

@@ -275,7 +275,7 @@ mod tests {
     }
 
     #[test]
-    fn images_without_depth_are_judged_by_color() {
+    fn images_without_depth_are_compared_by_color() {
         let score = |psnr_db| vec![HeldOutScore { psnr_db: Some(psnr_db), depth_rmse_m: None }; 3];
         assert!(doubling_trial(DOUBLED, &score(20.0), &score(20.3)).kept);
         let masked = vec![HeldOutScore { psnr_db: None, depth_rmse_m: None }; 3];

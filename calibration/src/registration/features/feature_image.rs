@@ -5,6 +5,7 @@
     reason = "coordinates in images are rounded down on purpose, after a check that they are inside"
 )]
 
+use crate::registration::prepared_image::brightness;
 use keyframe::Keyframe;
 use nalgebra::Vector2;
 use std::ops::Range;
@@ -125,22 +126,8 @@ impl FeatureImage {
 }
 
 fn levels(keyframe: &Keyframe) -> Vec<Level> {
-    let [width, height] = keyframe.size_px.map(|side| side as usize);
     let edge = keyframe.size_px[0].div_ceil(MAX_COLUMNS).max(1) as usize;
-    let size = [width / edge, height / edge];
-    let brightness = |ix: usize| {
-        let (x, y) = (ix % size[0], ix / size[0]);
-        let (mut sum, mut is_valid) = (0u32, true);
-        for row in y * edge..(y + 1) * edge {
-            for pixel in keyframe.rgba_srgb[4 * (row * width + x * edge)..].chunks_exact(4).take(edge) {
-                is_valid &= pixel[3] > 0;
-                // The weights sum to 256.
-                sum += 77 * u32::from(pixel[0]) + 150 * u32::from(pixel[1]) + 29 * u32::from(pixel[2]);
-            }
-        }
-        if is_valid { sum as f32 / (256 * edge * edge) as f32 } else { f32::NAN }
-    };
-    let values: Vec<f32> = (0..size[0] * size[1]).map(brightness).collect();
+    let (size, values) = brightness(keyframe, edge);
     let base = Level { size, texel_px: edge as f64, values };
     let base = match MIN_COLUMNS.div_ceil(keyframe.size_px[0]) {
         ..=1 => base,

@@ -125,8 +125,7 @@ impl FeatureScene {
     fn new(keyframes: &[Arc<Keyframe>]) -> Self {
         let mut ixs_of_camera = BTreeMap::<Arc<str>, Vec<usize>>::new();
         for (ix, keyframe) in keyframes.iter().enumerate() {
-            // Evicted keyframes have no pixels after recovery.
-            if keyframe.split != Split::Test && !keyframe.rgba_srgb.is_empty() {
+            if keyframe.split != Split::Test {
                 ixs_of_camera.entry(keyframe.camera.clone()).or_default().push(ix);
             }
         }
