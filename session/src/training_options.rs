@@ -145,7 +145,7 @@ impl TrainingOptions {
     pub fn check_learned(&self, kinds: &[ModelKind], available: AvailableData) -> Result<(), Error> {
         let can_align = |param: &Refine| match available.depth {
             true => *param != Refine::ImageGains,
-            false => available.color_only && *param == Refine::Extrinsics,
+            false => available.color_only && matches!(param, Refine::Extrinsics | Refine::TimeOffset | Refine::Lens),
         };
         let can_learn = |param: &Refine| {
             let set = param_set(std::slice::from_ref(param));
@@ -184,7 +184,8 @@ impl TrainingOptions {
         }
         let set = param_set(requested);
         if !available.depth {
-            let aligned = if available.color_only { set & ParamSet::EXTRINSICS } else { ParamSet::empty() };
+            let from_features = ParamSet::EXTRINSICS | ParamSet::TIME_OFFSET | ParamSet::LENS;
+            let aligned = if available.color_only { set & from_features } else { ParamSet::empty() };
             return Ok(RefineSettings {
                 align: CameraRefinement::Always(aligned),
                 with_scene: CameraRefinement::Always(set),
@@ -275,7 +276,9 @@ impl AvailableData {
         };
         let aligned = match self {
             Self { depth: true, .. } => candidates(),
-            Self { color_only: true, many_images_per_camera: true, .. } => vec![ParamSet::EXTRINSICS],
+            Self { color_only: true, many_images_per_camera: true, .. } => {
+                vec![ParamSet::EXTRINSICS, ParamSet::TIME_OFFSET, ParamSet::LENS]
+            }
             _ => Vec::new(),
         };
         RefineSettings {

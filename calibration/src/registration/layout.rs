@@ -1,7 +1,7 @@
 //! The parameters to estimate, their order, and their scales.
 
-use super::prepared_image::PreparedImage;
 use crate::ParamSet;
+use keyframe::Keyframe;
 
 /// Typical magnitudes of calibration errors. They set the damping of the solver and determine which directions count as
 /// observable.
@@ -70,12 +70,12 @@ pub(super) struct CameraParamOffsets {
 }
 
 impl Layout {
-    /// The parameters of a set that apply to the images. A static camera has no time offset, and a camera without
-    /// joints has no joint offsets.
-    pub(super) fn new(set: ParamSet, images: &[PreparedImage], n_cameras: usize) -> Self {
+    /// The parameters of a set that apply to keyframes, which are given with the index of their camera. A static camera
+    /// has no time offset, and a camera without joints has no joint offsets.
+    pub(super) fn new(set: ParamSet, images: &[(usize, &Keyframe)], n_cameras: usize) -> Self {
         let mut layout = Self::default();
         for camera in 0..n_cameras {
-            let keyframes = || images.iter().filter(move |image| image.camera == camera).map(|image| &image.keyframe);
+            let keyframes = || images.iter().filter(move |image| image.0 == camera).map(|image| image.1);
             let moves = keyframes().any(|keyframe| {
                 keyframe.twist.is_some_and(|twist| twist.linear_m_s.norm() + twist.angular_rad_s.norm() > 0.0)
             });
@@ -106,7 +106,7 @@ impl Layout {
                 }),
             });
         }
-        let n_joints = images.iter().map(|image| image.keyframe.joint_twists.len()).max().unwrap_or(0);
+        let n_joints = images.iter().map(|(_, keyframe)| keyframe.joint_twists.len()).max().unwrap_or(0);
         if set.contains(ParamSet::JOINTS) && n_joints > 0 {
             layout.joints = Some(layout.params.len());
             layout.params.extend((0..n_joints).map(CalibrationParam::Joint));
@@ -133,16 +133,5 @@ impl Layout {
     /// Index of the first joint offset.
     pub(super) fn joints(&self) -> Option<usize> {
         self.joints
-    }
-
-    /// The extrinsics of all cameras.
-    pub(super) fn extrinsics(n_cameras: usize) -> Self {
-        let parts = |camera| (0..6).map(move |part| CalibrationParam::Extrinsics(camera, part));
-        let offsets = |camera| CameraParamOffsets { extrinsics: Some(6 * camera), ..CameraParamOffsets::default() };
-        Self {
-            params: (0..n_cameras).flat_map(parts).collect(),
-            by_camera: (0..n_cameras).map(offsets).collect(),
-            joints: None,
-        }
     }
 }

@@ -79,8 +79,8 @@ pub fn candidates() -> Vec<ParamSet> {
     ]
 }
 
-/// Estimates the requested parameters; `None` if too few keyframes overlap. Without depth, only extrinsics are
-/// estimated, from matched features.
+/// Estimates the requested parameters; `None` if too few keyframes overlap. Without depth, extrinsics, time offsets and
+/// lenses are estimated from matched features, and other parameters are not.
 ///
 /// Parameters are estimated from training keyframes and evaluated on validation keyframes; test keyframes are not
 /// used.
@@ -160,10 +160,16 @@ impl AlignmentScene {
         (pairs.len() >= MIN_PAIRS).then_some(Self { images, cameras, pairs, all_pairs, validation_pairs })
     }
 
+    /// The parameters of a set that apply to the images.
+    fn layout(&self, set: ParamSet) -> Layout {
+        let images: Vec<_> = self.images.iter().map(|image| (image.camera, &*image.keyframe)).collect();
+        Layout::new(set, &images, self.cameras.len())
+    }
+
     /// Estimates the corrections of a set of parameters, starting from those of another set.
     fn model(&self, set: ParamSet, from: &CalibrationModel) -> Option<CalibrationModel> {
         let shared = set - (ParamSet::IMAGE_POSES | ParamSet::IMAGE_GAINS);
-        let layout = Layout::new(shared, &self.images, self.cameras.len());
+        let layout = self.layout(shared);
         let mut fit = None;
         let mut corrections = self.restricted(&layout, &from.corrections);
         if layout.n() > 0 {
@@ -225,7 +231,7 @@ impl AlignmentScene {
         let mut kept = uncorrected;
         let mut kept_sets: Vec<ParamSet> = Vec::new();
         for candidate in candidates {
-            let layout = Layout::new(*candidate, &self.images, self.cameras.len());
+            let layout = self.layout(*candidate);
             if layout.n() == 0 && !candidate.contains(ParamSet::IMAGE_POSES) {
                 continue;
             }

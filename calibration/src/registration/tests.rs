@@ -141,7 +141,7 @@ fn reported_sigmas_match_actual_errors() {
         let miscalibration =
             Miscalibration { extrinsics: wrong_extrinsics(), seed, noise: 3.0, ..Miscalibration::none() };
         let scene = AlignmentScene::new(&capture(&miscalibration), false).unwrap();
-        let layout = Layout::new(ParamSet::EXTRINSICS, &scene.images, 1);
+        let layout = scene.layout(ParamSet::EXTRINSICS);
         let fit = fit::fit(&scene.images, &scene.pairs, layout, &Corrections::none(1)).unwrap();
         let correction = &fit.corrections.by_camera[0];
         let remaining = transform::log(
@@ -184,7 +184,7 @@ fn max_jacobian_errors(has_rolling_shutter: bool) -> Vec<(layout::CalibrationPar
     let mut scene = AlignmentScene::new(&capture(&miscalibration), false).unwrap();
     scene.images.iter_mut().for_each(set_linear_brightness);
     let all: ParamSet = candidates().into_iter().collect();
-    let layout = Layout::new(all, &scene.images, 1);
+    let layout = scene.layout(all);
     let mut here = Corrections::none(1);
     // Joint offsets are zero: their columns are those at the measured joint positions, to first order.
     let displaced = layout.params.iter().enumerate().map(|(ix, param)| match param {

@@ -46,11 +46,23 @@ pub(super) type Descriptor = [f32; DESCRIPTOR_LEN];
 /// A corner of an image.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Corner {
-    /// Ray through the corner: x and y at a depth of 1.
+    /// Position in the keyframe, pixels.
+    pub(super) px: [f64; 2],
+    /// Ray through the corner with the keyframe's lens: x and y at a depth of 1.
     pub(super) ray: Vector2<f64>,
+    /// When the corner's row was read out, as a share of the readout time: -0.5 for the first row, 0.5 for the last.
+    pub(super) row_share: f64,
     /// Position in texels of the level, where the center of the first texel is 0.
     texel: [f64; 2],
     pub(super) level: usize,
+}
+
+impl Corner {
+    /// A corner without an image.
+    #[cfg(test)]
+    pub(super) fn at(px: [f64; 2], row_share: f64) -> Self {
+        Self { px, ray: Vector2::zeros(), row_share, texel: [0.0; 2], level: 0 }
+    }
 }
 
 /// An image with its corners.
@@ -87,11 +99,10 @@ impl FeatureImage {
         for (ix, level) in levels.iter().enumerate() {
             for texel in level.corners(cell) {
                 let Some(descriptor) = level.descriptor(texel, [1.0, 0.0]) else { continue };
-                let axis = |axis: usize| {
-                    let px = (texel[axis] + 0.5) * level.texel_px;
-                    (px - keyframe.principal_px[axis]) / keyframe.focal_px[axis]
-                };
-                corners.push(Corner { ray: Vector2::new(axis(0), axis(1)), texel, level: ix });
+                let px = texel.map(|coordinate| (coordinate + 0.5) * level.texel_px);
+                let axis = |axis: usize| (px[axis] - keyframe.principal_px[axis]) / keyframe.focal_px[axis];
+                let row_share = px[1] / f64::from(keyframe.size_px[1]) - 0.5;
+                corners.push(Corner { px, ray: Vector2::new(axis(0), axis(1)), row_share, texel, level: ix });
                 descriptors.push(descriptor);
             }
         }

@@ -1,6 +1,7 @@
 //! Selection of pairs of images that may show the same surface, without depth.
 
 use super::feature_image::FeatureImage;
+use super::moving_camera::MovingCamera;
 use crate::registration::pairs::Pair;
 use kinematics::Transform;
 use kinematics::quantile::median;
@@ -22,8 +23,9 @@ const GRID: [usize; 2] = [6, 5];
 
 /// Chooses at most `max_partners` partners for each image, spread evenly over the relative motions. Two images form at
 /// most one pair.
-pub(super) fn choose(images: &[FeatureImage], poses: &[Transform], max_partners: usize) -> Vec<Pair> {
-    let median_baseline_m = median_baseline_m(poses);
+pub(super) fn choose(images: &[FeatureImage], cameras: &[MovingCamera], max_partners: usize) -> Vec<Pair> {
+    let poses: Vec<Transform> = cameras.iter().map(|camera| camera.world_from_camera).collect();
+    let median_baseline_m = median_baseline_m(&poses);
     let min_baseline_m = (MIN_BASELINE_FRAC * median_baseline_m).max(MIN_BASELINE_M);
     let partners_of = |to: usize| {
         let distance = |from: usize| {

@@ -1,6 +1,7 @@
 //! Matches of corners between two images whose relative pose is approximately known.
 
 use super::feature_image::{Corner, DESCRIPTOR_LEN, Descriptor, FeatureImage};
+use super::moving_camera::{MovingCamera, Sighting};
 use kinematics::Transform;
 use nalgebra::{Matrix3, Vector2, Vector3};
 
@@ -14,42 +15,45 @@ const SAME_CORNER_TEXELS: f64 = 3.0;
 const MAX_LEVEL_DIFFERENCE: usize = 1;
 
 /// Two corners that show the same point.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug)]
 pub(super) struct Match {
-    /// Rays in the two images: x and y at a depth of 1.
-    pub(super) rays: [Vector2<f64>; 2],
+    /// The corners in the two images.
+    pub(super) corners: [Corner; 2],
     /// Size of the larger corner's texels, radians.
     pub(super) texel_rad: f64,
 }
 
 /// The essential matrix of a relative pose.
-pub(super) fn essential(to_from_from: &Transform) -> Matrix3<f64> {
-    to_from_from.translation.vector.cross_matrix() * to_from_from.rotation.to_rotation_matrix().matrix()
+///
+/// * `translation_m`: position of the first camera in the frame of the second.
+pub(super) fn essential(rotation: &Matrix3<f64>, translation_m: &Vector3<f64>) -> Matrix3<f64> {
+    translation_m.cross_matrix() * rotation
 }
 
 /// Matches corners of one image with those of another.
 ///
-/// * `to_from_from`: approximate relative pose.
+/// * `cameras`: approximate poses of the two images.
 /// * `tolerance_rad`: maximum distance of a match from its epipolar line.
 pub(super) fn matches(
     from: &FeatureImage,
     to: &FeatureImage,
-    to_from_from: &Transform,
+    cameras: [&MovingCamera; 2],
     tolerance_rad: f64,
 ) -> Vec<Match> {
+    let to_from_from = cameras[1].world_from_camera.inverse() * cameras[0].world_from_camera;
     let rotation = to_from_from.rotation.to_rotation_matrix();
-    let essential = essential(to_from_from);
+    // The motion of the second camera during readout is small compared with the tolerance.
+    let rays: Vec<Vector2<f64>> = to.corners.iter().map(|corner| cameras[1].sighting(corner).ray).collect();
     let descriptors: Vec<Option<Descriptor>> =
         to.corners.iter().map(|corner| to.rotated_descriptor(corner, roll(rotation.matrix(), &corner.ray)?)).collect();
     let mut best_of_to: Vec<(f32, usize)> = vec![(MIN_CORRELATION, usize::MAX); to.corners.len()];
     let mut best_of_from: Vec<Option<usize>> = vec![None; from.corners.len()];
     let mut candidates: Vec<(f32, usize)> = Vec::new();
     for (ix, corner) in from.corners.iter().enumerate() {
-        let ray = corner.ray.push(1.0);
-        let band = Band::new(&essential, rotation * ray, to_from_from, &ray, tolerance_rad);
+        let band = Band::new(&cameras[0].sighting(corner), &to_from_from, tolerance_rad);
         candidates.clear();
         for other_ix in to.corners_of_levels(corner.level, MAX_LEVEL_DIFFERENCE) {
-            if !band.contains(&to.corners[other_ix].ray) {
+            if !band.contains(&rays[other_ix]) {
                 continue;
             }
             let Some(descriptor) = &descriptors[other_ix] else { continue };
@@ -75,7 +79,7 @@ pub(super) fn matches(
         let other = (*best)?;
         let (one, other) = (best_of_to[other].1 == ix).then_some((&from.corners[ix], &to.corners[other]))?;
         let texel_rad = from.texel_rad(one).max(to.texel_rad(other));
-        Some(Match { rays: [one.ray, other.ray], texel_rad })
+        Some(Match { corners: [*one, *other], texel_rad })
     };
     best_of_from.iter().enumerate().filter_map(mutual).collect()
 }
@@ -100,18 +104,14 @@ struct Band {
 }
 
 impl Band {
-    fn new(
-        essential: &Matrix3<f64>,
-        at_infinity: Vector3<f64>,
-        to_from_from: &Transform,
-        ray: &Vector3<f64>,
-        tolerance_rad: f64,
-    ) -> Self {
-        let line = essential * ray;
+    fn new(corner: &Sighting, to_from_from: &Transform, tolerance_rad: f64) -> Self {
+        let ray = corner.ray.push(1.0);
+        let at_infinity = to_from_from.rotation * ray;
+        let translation = to_from_from.transform_point(&corner.center_m.into()).coords;
+        let line = translation.cross(&at_infinity);
         let scale = line.xy().norm().max(f64::MIN_POSITIVE);
         let from_infinity = (at_infinity.z > 0.1).then(|| {
             let position = at_infinity.xy() / at_infinity.z;
-            let translation = to_from_from.translation.vector;
             let direction = (translation.xy() - position * translation.z).try_normalize(0.0);
             (position, direction.unwrap_or_default())
         });

@@ -1,15 +1,16 @@
-//! Estimates the extrinsics of cameras from color images alone: corners are matched between images, and each match must
-//! lie near its epipolar line, which follows from the poses of the two images.
+//! Estimates extrinsics, time offsets and lenses of cameras from color images alone: corners are matched between images,
+//! and each match must lie near its epipolar line, which follows from the poses of the two images.
 //!
-//! An error of the extrinsics moves the epipolar lines of image pairs with different relative rotations differently, so
-//! it is observable without knowing any depth. The search for matches uses the approximately known poses: it is limited
-//! to a band around the epipolar line, and patches are rotated by the relative rotation of the images. Matches are
-//! searched again in a narrower band after each estimate.
+//! An error of the extrinsics moves the epipolar lines of image pairs with different relative rotations differently, and
+//! a time offset those of images with different velocities, so both are observable without knowing any depth. The search
+//! for matches uses the approximately known poses: it is limited to a band around the epipolar line, and patches are
+//! rotated by the relative rotation of the images. Matches are searched again in a narrower band after each estimate.
 
 mod epipolar;
 mod feature_image;
 mod image_pairs;
 mod matching;
+mod moving_camera;
 #[cfg(test)]
 mod tests;
 
@@ -20,12 +21,13 @@ use super::pairs::Pair;
 use super::report::{self, Alignment};
 use super::solve::Solution;
 use super::{AlignmentScene, CalibrationModel, MAX_IMAGES, MIN_PAIRS};
-use crate::{CameraCorrection, CameraRefinement, Candidate, ParamSet, Trial, rigid_transform};
+use crate::{CameraCorrection, CameraRefinement, Candidate, ParamSet, Trial};
 use epipolar::PairMatches;
 use feature_image::FeatureImage;
 use keyframe::{Keyframe, Split};
 use kinematics::Transform;
 use kinematics::quantile::{Rank, quantile};
+use moving_camera::MovingCamera;
 use nalgebra::{DVector, Vector3};
 use rayon::prelude::*;
 use std::collections::{BTreeMap, BTreeSet};
@@ -51,11 +53,13 @@ struct Round {
     n_partners: usize,
 }
 
-/// Rounds of matching. A few pairs are enough for the coarse ones.
-const ROUNDS: [Round; 4] = [
+/// Rounds of matching. A few pairs are enough for the coarse ones. The last one is repeated, because matches near the
+/// edge of the band pull the estimate towards its start.
+const ROUNDS: [Round; 5] = [
     Round { rotation_rad: 0.105, translation_m: 0.03, n_partners: 4 },
     Round { rotation_rad: 0.05, translation_m: 0.02, n_partners: 4 },
     Round { rotation_rad: 0.02, translation_m: 0.01, n_partners: 6 },
+    LAST_ROUND,
     LAST_ROUND,
 ];
 const LAST_ROUND: Round = Round { rotation_rad: 0.01, translation_m: 0.004, n_partners: 12 };
@@ -83,42 +87,46 @@ const CONVERGED_STEP_SIGMAS: f64 = 0.05;
 const MIN_INNER_MATCHES: f64 = 0.5;
 const MAX_INNER_FRAC: f64 = 0.25;
 
+/// Parameters that matched features determine.
+const PARAMS: ParamSet = ParamSet::EXTRINSICS.union(ParamSet::TIME_OFFSET).union(ParamSet::LENS);
+
 /// Images with corners.
 struct FeatureScene {
     images: Vec<FeatureImage>,
     cameras: Vec<Arc<str>>,
-    layout: Layout,
 }
 
-/// Estimates extrinsics from color if they are requested; `None` if too few images overlap or have corners.
+/// Estimates the requested parameters from color; `None` if none of them can be estimated from color, or if too few
+/// images overlap or have corners.
 ///
-/// Extrinsics are estimated from training and validation keyframes and evaluated by cross-validation; test keyframes are
+/// Parameters are estimated from training and validation keyframes and evaluated by cross-validation; test keyframes are
 /// not used.
 pub(super) fn align(keyframes: &[Arc<Keyframe>], choice: &CameraRefinement) -> Option<Alignment> {
-    let includes_extrinsics = |set: &ParamSet| set.contains(ParamSet::EXTRINSICS);
-    if !includes_extrinsics(&choice.always()) && !choice.candidates().iter().any(includes_extrinsics) {
+    let always = choice.always() & PARAMS;
+    let candidates = choice.candidates().iter().map(|set| *set & PARAMS);
+    let sets: Vec<ParamSet> = [always].into_iter().chain(candidates).filter(|set| !set.is_empty()).collect();
+    if sets.is_empty() {
         return None;
     }
     let scene = FeatureScene::new(keyframes);
-    let (pairs, fit) = scene.estimate()?;
-    let mut trial = scene.cross_validate(&fit.corrections);
-    let corrections = fit.corrections.clone();
-    let variant = CalibrationModel { set: ParamSet::EXTRINSICS, fit: Some(fit), corrections };
-    trial.kept &= trial.gain_db > MIN_GAIN_DB && variant.has_significant(&scene.layout);
-    let is_kept = trial.kept || matches!(choice, CameraRefinement::Always(_));
-    let summary = AlignmentScene {
-        images: Vec::new(),
-        cameras: scene.cameras.clone(),
-        pairs,
-        all_pairs: Vec::new(),
-        validation_pairs: Vec::new(),
-    };
-    let unobservable = variant.fit.iter().flat_map(|fit| report::unobservable(&summary, fit)).collect();
-    let kept = match is_kept {
-        true => variant,
-        false => CalibrationModel { set: ParamSet::empty(), fit: None, corrections: scene.uncorrected() },
-    };
-    Some(report::alignment(&summary, &kept, vec![trial], unobservable))
+    let mut kept = CalibrationModel { set: ParamSet::empty(), fit: None, corrections: scene.uncorrected() };
+    let (mut trials, mut unobservable, mut pairs) = (Vec::new(), Vec::new(), None);
+    for set in sets {
+        let Some((variant_pairs, variant)) = scene.model(kept.set | set, &kept) else { continue };
+        let mut trial = scene.cross_validate(set, &kept, &variant);
+        trial.kept &= trial.gain_db > MIN_GAIN_DB && variant.has_significant(&scene.layout(set));
+        let is_kept = trial.kept || matches!(choice, CameraRefinement::Always(_));
+        if is_kept || set.contains(ParamSet::EXTRINSICS) {
+            let summary = scene.summary(&variant_pairs);
+            unobservable = variant.fit.iter().flat_map(|fit| report::unobservable(&summary, fit)).collect();
+        }
+        pairs.get_or_insert_with(|| variant_pairs.clone());
+        if is_kept {
+            (kept, pairs) = (variant, Some(variant_pairs));
+        }
+        trials.push(trial);
+    }
+    Some(report::alignment(&scene.summary(&pairs?), &kept, trials, unobservable))
 }
 
 impl FeatureScene {
@@ -140,23 +148,33 @@ impl FeatureScene {
         let cameras: Vec<Arc<str>> = ixs_of_camera.into_keys().collect();
         let camera_of = |keyframe: &Keyframe| cameras.partition_point(|name| *name < keyframe.camera);
         let images = used.par_iter().map(|keyframe| FeatureImage::new(keyframe, camera_of(keyframe))).collect();
-        Self { images, layout: Layout::extrinsics(cameras.len()), cameras }
+        Self { images, cameras }
     }
 
     fn uncorrected(&self) -> Corrections {
         Corrections::none(self.cameras.len())
     }
 
-    /// Corrected poses of the images.
-    fn poses(&self, corrections: &Corrections) -> Vec<Transform> {
-        let camera_from_corrected: Vec<Transform> = corrections
-            .by_camera
-            .iter()
-            .map(|correction| {
-                rigid_transform(correction.rotation_rad.into(), correction.translation_m.into()).inverse()
-            })
-            .collect();
-        self.images.iter().map(|image| image.keyframe.world_from_camera * camera_from_corrected[image.camera]).collect()
+    fn layout(&self, set: ParamSet) -> Layout {
+        let images: Vec<_> = self.images.iter().map(|image| (image.camera, &*image.keyframe)).collect();
+        Layout::new(set, &images, self.cameras.len())
+    }
+
+    /// What reports need to know of the images.
+    fn summary(&self, pairs: &[Pair]) -> AlignmentScene {
+        AlignmentScene {
+            images: Vec::new(),
+            cameras: self.cameras.clone(),
+            pairs: pairs.to_vec(),
+            all_pairs: Vec::new(),
+            validation_pairs: Vec::new(),
+        }
+    }
+
+    /// Cameras of the images with corrections.
+    fn moving_cameras(&self, corrections: &Corrections) -> Vec<MovingCamera> {
+        let of_image = |image: &FeatureImage| MovingCamera::new(&image.keyframe, &corrections.by_camera[image.camera]);
+        self.images.iter().map(of_image).collect()
     }
 
     /// Half the width of the search band of a pair, radians.
@@ -175,12 +193,14 @@ impl FeatureScene {
 
     /// Matches pairs of images near their epipolar lines. Pairs with few matches are dropped.
     fn matches(&self, corrections: &Corrections, round: &Round) -> Vec<PairMatches> {
-        let poses = self.poses(corrections);
+        let cameras = self.moving_cameras(corrections);
         let of_pair = |pair: Pair| {
-            let to_from_from = poses[pair.to].inverse() * poses[pair.from];
+            let pair_cameras = [&cameras[pair.from], &cameras[pair.to]];
+            let [from_pose, to_pose] = pair_cameras.map(|camera| camera.world_from_camera);
+            let to_from_from = to_pose.inverse() * from_pose;
             let band_rad = self.band_rad(&pair, &to_from_from, round);
             let (from, to) = (&self.images[pair.from], &self.images[pair.to]);
-            let matches = matching::matches(from, to, &to_from_from, band_rad);
+            let matches = matching::matches(from, to, pair_cameras, band_rad);
             (matches.len() >= MIN_MATCHES).then_some(PairMatches {
                 pair,
                 cameras: [from.camera, to.camera],
@@ -188,56 +208,65 @@ impl FeatureScene {
                 band_rad,
             })
         };
-        image_pairs::choose(&self.images, &poses, round.n_partners).into_par_iter().filter_map(of_pair).collect()
+        image_pairs::choose(&self.images, &cameras, round.n_partners).into_par_iter().filter_map(of_pair).collect()
     }
 
-    /// Estimates the extrinsics in rounds of matching, and returns the pairs of the last round. `None` without
-    /// consistent matches.
-    fn estimate(&self) -> Option<(Vec<Pair>, Fit)> {
-        let mut corrections = self.uncorrected();
+    /// Estimates a set of parameters in rounds of matching, starting from another model. Also returns the pairs of the
+    /// last round. `None` without consistent matches.
+    fn model(&self, set: ParamSet, start: &CalibrationModel) -> Option<(Vec<Pair>, CalibrationModel)> {
+        let mut corrections = start.corrections.clone();
+        // Once extrinsics are known, or if they are assumed to be known, the coarse rounds are not needed.
+        let is_coarse = set.contains(ParamSet::EXTRINSICS) && !start.set.contains(ParamSet::EXTRINSICS);
+        let rounds = if is_coarse { &ROUNDS[..] } else { &ROUNDS[1..] };
         let mut last = None;
-        for round in &ROUNDS {
+        for (ix, round) in rounds.iter().enumerate() {
+            // In wide bands, wrong matches disturb the less observable parameters.
+            let layout = self.layout(if ix >= 2 || !is_coarse { set } else { ParamSet::EXTRINSICS });
+            if layout.n() == 0 {
+                return None;
+            }
             let matches = self.matches(&corrections, round);
             if matches.len() < MIN_PAIRS {
                 return None;
             }
-            let fit = self.fit(&matches, &corrections)?;
+            let fit = self.fit(&matches, &layout, &corrections)?;
             corrections = fit.corrections.clone();
             last = Some((matches, fit));
         }
         let (matches, fit) = last?;
-        let poses = self.poses(&corrections);
+        let cameras = self.moving_cameras(&corrections);
         let is_inner = |pair: &PairMatches, distance: &f64| distance.abs() < MAX_INNER_FRAC * pair.band_rad;
         let of_pair = |pair: &PairMatches| {
-            let distances = pair.distances_rad(&poses);
+            let distances = pair.distances_rad(&cameras);
             (distances.iter().filter(|distance| is_inner(pair, distance)).count(), distances.len())
         };
         let (n_inner, n) = matches.iter().map(of_pair).fold((0, 0), |all, pair| (all.0 + pair.0, all.1 + pair.1));
         log::debug!("features: {n_inner} of {n} matches are consistent");
         let is_consistent = n_inner as f64 > MIN_INNER_MATCHES * n as f64;
-        is_consistent.then(|| (matches.iter().map(|pair| pair.pair).collect(), fit))
+        let model = CalibrationModel { set, fit: Some(fit), corrections };
+        is_consistent.then(|| (matches.iter().map(|pair| pair.pair).collect(), model))
     }
 
     /// Minimizes the distances of given matches, with decreasing influence of distant ones.
-    fn fit(&self, matches: &[PairMatches], start: &Corrections) -> Option<Fit> {
+    fn fit(&self, matches: &[PairMatches], layout: &Layout, start: &Corrections) -> Option<Fit> {
         let pairs: Vec<Pair> = matches.iter().map(|pair| pair.pair).collect();
         let mut corrections = start.clone();
         let mut assumed_noise: Option<f64> = None;
         let mut last = None;
         for _ in 0..MAX_ITERATIONS {
-            let poses = self.poses(&corrections);
-            let mut distances: Vec<f64> = matches.iter().flat_map(|pair| pair.distances_texels(&poses)).collect();
+            let cameras = self.moving_cameras(&corrections);
+            let mut distances: Vec<f64> = matches.iter().flat_map(|pair| pair.distances_texels(&cameras)).collect();
             distances.iter_mut().for_each(|distance| *distance = distance.abs());
             let measured = 1.4826 * quantile(&mut distances, 0.5, Rank::Upper)?;
             let target = measured.clamp(MIN_NOISE_TEXELS, MAX_NOISE_TEXELS);
             let noise_texels = assumed_noise.map_or(measured, |assumed| ANNEALING * assumed).max(target);
             assumed_noise = Some(noise_texels);
-            let sums: Vec<_> = matches.par_iter().map(|pair| pair.sums(&poses, &self.layout, noise_texels)).collect();
-            let scales = self.layout.params.iter().map(|param| SCALE * param.scale());
-            let values = self.layout.params.iter().map(|param| corrections.value(*param));
+            let sums: Vec<_> = matches.par_iter().map(|pair| pair.sums(&cameras, layout, noise_texels)).collect();
+            let scales = layout.params.iter().map(|param| SCALE * param.scale());
+            let values = layout.params.iter().map(|param| corrections.value(*param));
             let [scales, values] = [scales.collect::<Vec<f64>>(), values.collect()].map(DVector::from);
             let solution = Solution::new(scales, &values, &pairs, &sums);
-            corrections.apply_step(&self.layout, &solution.step);
+            corrections.apply_step(layout, &solution.step);
             let is_converged = noise_texels <= target && solution.step_in_sigmas() < CONVERGED_STEP_SIGMAS;
             log::debug!(
                 "features: {} matches, noise {noise_texels:.2} texels, step of {:.2} sigma",
@@ -249,34 +278,39 @@ impl FeatureScene {
                 break;
             }
         }
-        Some(Fit { corrections, layout: self.layout.clone(), solution: last?, noise: INITIAL_NOISE })
+        Some(Fit { corrections, layout: layout.clone(), solution: last?, noise: INITIAL_NOISE })
     }
 
-    /// Evaluates by cross-validation how much closer to their epipolar lines matches are with corrections: corrections
-    /// are estimated without one group of images, and applied to the matches of this group.
-    fn cross_validate(&self, corrections: &Corrections) -> Trial {
-        // The band around the given epipolar lines also contains the estimated ones.
-        let largest = |part: fn(&CameraCorrection) -> [f64; 3]| {
-            let norm = |correction| Vector3::from(part(correction)).norm();
-            corrections.by_camera.iter().map(norm).fold(0.0, f64::max)
+    /// Evaluates by cross-validation how much closer to their epipolar lines matches are with the variant than with the
+    /// baseline: both are estimated again without one group of images, and applied to the matches of this group.
+    fn cross_validate(&self, set: ParamSet, baseline: &CalibrationModel, variant: &CalibrationModel) -> Trial {
+        // The band around the epipolar lines of the baseline also contains those of the variant.
+        let largest_change = |part: fn(&CameraCorrection) -> [f64; 3]| {
+            let both = baseline.corrections.by_camera.iter().zip(&variant.corrections.by_camera);
+            let change = both.map(|(before, after)| (Vector3::from(part(after)) - Vector3::from(part(before))).norm());
+            change.fold(0.0, f64::max)
         };
         let round = Round {
-            rotation_rad: LAST_ROUND.rotation_rad + largest(|correction| correction.rotation_rad),
-            translation_m: LAST_ROUND.translation_m + largest(|correction| correction.translation_m),
+            rotation_rad: LAST_ROUND.rotation_rad + largest_change(|correction| correction.rotation_rad),
+            translation_m: LAST_ROUND.translation_m + largest_change(|correction| correction.translation_m),
             n_partners: CROSS_VALIDATION_PARTNERS,
         };
-        let matches = self.matches(&self.uncorrected(), &round);
-        let baseline = self.poses(&self.uncorrected());
+        let matches = self.matches(&baseline.corrections, &round);
+        let [baseline_layout, variant_layout] = [baseline, variant].map(|model| self.layout(model.set));
         let of_fold = |fold: usize| {
             let is_held_out = |image: usize| image % N_FOLDS == fold;
             let (tested, used): (Vec<PairMatches>, Vec<PairMatches>) =
                 matches.iter().cloned().partition(|pair| is_held_out(pair.pair.from) || is_held_out(pair.pair.to));
-            let variant = self.fit(&used, corrections).map(|fit| self.poses(&fit.corrections));
+            let fitted = |layout: &Layout, model: &CalibrationModel| match layout.n() {
+                0 => Some(self.moving_cameras(&model.corrections)),
+                _ => self.fit(&used, layout, &model.corrections).map(|fit| self.moving_cameras(&fit.corrections)),
+            };
+            let both = fitted(&baseline_layout, baseline).zip(fitted(&variant_layout, variant));
             let gain_db = |image: usize| {
-                let variant = variant.as_ref()?;
+                let (baseline, variant) = both.as_ref()?;
                 let pairs = tested.iter().filter(|pair| pair.pair.from == image || pair.pair.to == image);
                 let gains = pairs.flat_map(|pair| {
-                    let distances = pair.distances_texels(&baseline).into_iter().zip(pair.distances_texels(variant));
+                    let distances = pair.distances_texels(baseline).into_iter().zip(pair.distances_texels(variant));
                     distances
                         .map(|(before, after)| 20.0 * (NOISE_TEXELS.hypot(before) / NOISE_TEXELS.hypot(after)).log10())
                 });
@@ -286,7 +320,7 @@ impl FeatureScene {
             (0..self.images.len()).filter(|image| is_held_out(*image)).filter_map(gain_db).collect::<Vec<f64>>()
         };
         let gains_db: Vec<f64> = (0..N_FOLDS).into_par_iter().flat_map_iter(of_fold).collect();
-        log::debug!("features: gains {gains_db:.2?} dB");
-        Trial::of_gains(Candidate::Cameras(ParamSet::EXTRINSICS), &gains_db).with_enough_images()
+        log::debug!("features: {set}: gains {gains_db:.2?} dB");
+        Trial::of_gains(Candidate::Cameras(set), &gains_db).with_enough_images()
     }
 }

@@ -41,6 +41,44 @@ fn hidden_errors_are_found_with_any_number_of_threads() {
 }
 
 #[test]
+fn rolling_shutters_do_not_bias_the_estimate() {
+    for error in [Transform::identity(), wrong_extrinsics()] {
+        let miscalibration = Miscalibration { has_rolling_shutter: true, ..with_extrinsics(error) };
+        let alignment = crate::align(&scan(&miscalibration), &CameraRefinement::Always(EXTRINSICS)).unwrap();
+        let (degrees, mm) = remaining(&alignment.corrections["wrist"], &error);
+        assert!(degrees < 0.1 && mm < 3.0, "{degrees} degrees, {mm} mm");
+    }
+}
+
+#[test]
+fn time_offsets_are_found_from_color() {
+    let candidates = [EXTRINSICS, ParamSet::TIME_OFFSET, ParamSet::LENS].to_vec();
+    let miscalibration = Miscalibration { time_offset_secs: 0.02, ..with_extrinsics(wrong_extrinsics()) };
+    let alignment = crate::align(&scan(&miscalibration), &CameraRefinement::Try(candidates.clone())).unwrap();
+    let kept: Vec<bool> = alignment.trials.iter().map(|trial| trial.kept).collect();
+    assert_eq!(kept, [true, true, false], "{:?}", alignment.trials);
+    let correction = &alignment.corrections["wrist"];
+    assert!((correction.time_offset_secs - 0.02).abs() < 0.001, "{} s", correction.time_offset_secs);
+    let (degrees, mm) = remaining(correction, &wrong_extrinsics());
+    // In 20 ms, the velocity changes, which the estimate neglects. Without the time offset: 0.77 degrees and 24 mm.
+    assert!(degrees < 0.4 && mm < 10.0, "{degrees} degrees, {mm} mm");
+    // Nothing is changed if nothing is wrong.
+    let alignment = crate::align(&scan(&Miscalibration::none()), &CameraRefinement::Try(candidates)).unwrap();
+    assert!(!alignment.has_corrections(), "{:?}", alignment.trials);
+}
+
+/// If extrinsics are estimated, too, they absorb an error of the focal length: a scan at a constant distance from the
+/// scene hardly distinguishes a longer focal length from a camera that is nearer.
+#[test]
+fn lenses_are_found_from_color_if_extrinsics_are_known() {
+    let keyframes = scan(&Miscalibration { focal_frac: 0.03, ..Miscalibration::none() });
+    let alignment = crate::align(&keyframes, &CameraRefinement::Try(vec![ParamSet::LENS])).unwrap();
+    assert!(alignment.trials[0].kept, "{:?}", alignment.trials);
+    let log_focal = alignment.corrections["wrist"].log_focal;
+    assert!(log_focal.iter().all(|log| (log + 0.03).abs() < 0.004), "{log_focal:?}");
+}
+
+#[test]
 fn each_camera_has_its_own_error() {
     let errors = [wrong_extrinsics(), large_error()];
     let scans = errors.map(|error| scan(&with_extrinsics(error)));
@@ -101,9 +139,11 @@ fn unobservable_translations_stay_at_zero() {
 }
 
 #[test]
-fn only_requested_extrinsics_are_estimated() {
+fn only_requested_parameters_are_estimated() {
     let keyframes = scan(&with_extrinsics(large_error()));
-    for choice in [CameraRefinement::Always(ParamSet::LENS), CameraRefinement::Try(vec![ParamSet::TIME_OFFSET])] {
+    for choice in [CameraRefinement::Always(ParamSet::JOINTS), CameraRefinement::Try(vec![ParamSet::DEPTH_POSE])] {
         assert_eq!(crate::align(&keyframes, &choice), None);
     }
+    let alignment = crate::align(&scan(&Miscalibration::none()), &CameraRefinement::Always(ParamSet::LENS)).unwrap();
+    assert!(matches!(&alignment.estimates[..], [report::Estimate::Lens { .. }]), "{:?}", alignment.estimates);
 }
