@@ -1,7 +1,7 @@
 //! The subcommands and their `--help` summaries. The flags of each subcommand are at the top of its own file.
 
 use crate::commands::{
-    bench, devices, doctor, eval, export, fk, metrics, move_arm, record, render, run, sim, train, view,
+    bench, calibrate, devices, doctor, eval, export, fk, metrics, move_arm, record, render, run, sim, train, view,
 };
 use crate::exit::Exit;
 use clap::{ArgAction, Parser, Subcommand};
@@ -46,6 +46,8 @@ pub(crate) enum Command {
     Metrics(metrics::Args),
     /// Convert a model or a recording to formats of other programs
     Export(export::Args),
+    /// Calibrate cameras: hand-eye, time offset, lens, joints
+    Calibrate(calibrate::Args),
     /// Compute the pose of a robot's tip for given joint values
     Fk(fk::Args),
     /// Measure speed, accuracy, robustness and memory; draws charts
@@ -72,6 +74,7 @@ impl Command {
             Self::Eval(args) => eval::run(&args),
             Self::Metrics(args) => metrics::run(args).map(|()| Exit::Done),
             Self::Export(args) => export::run(&args),
+            Self::Calibrate(args) => calibrate::run(&args),
             Self::Fk(args) => fk::run(args).map(|()| Exit::Done),
             Self::Bench(args) => bench::run(&args),
             Self::Devices(args) => devices::run(&args),

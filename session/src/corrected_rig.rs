@@ -1,7 +1,7 @@
 //! Writes a rig file with the calibration corrections that were estimated.
 
-use crate::Error;
 use crate::error::Context;
+use crate::{Error, run_folder};
 use calibration::{Alignment, CameraCorrection, Estimate};
 use capture::config::{Camera, Rig, TimeOffset};
 use kinematics::{Chain, Intrinsics, Stamp, Transform};
@@ -85,13 +85,19 @@ fn other_robot(rig: &Rig, file: &Path) -> Option<PathBuf> {
     (existing != rig.arm.urdf_text).then_some(urdf)
 }
 
-/// Writes a rig file and the robot's URDF next to it. Does not overwrite the URDF of another robot.
+/// Writes a rig file atomically, and the robot's URDF next to it. A file that it replaces is kept with the extension
+/// `.old`. Does not overwrite the URDF of another robot.
 pub fn write(rig: &Rig, file: &Path) -> crate::Result<()> {
     check_target_file(rig, file)?;
     let urdf = file.with_file_name(drivers::recording::URDF_FILE);
     let in_file = || format!("cannot write {}", file.display());
     std::fs::write(&urdf, &rig.arm.urdf_text).with_context(in_file)?;
-    std::fs::write(file, rig.to_toml()).with_context(in_file)
+    if file.exists() {
+        let mut old = file.as_os_str().to_owned();
+        old.push(".old");
+        std::fs::copy(file, old).with_context(in_file)?;
+    }
+    run_folder::write_atomic(file, &rig.to_toml()).with_context(in_file)
 }
 
 /// Applies a correction. `estimates` contain the standard deviation of the time offset, if it is known; `source` names

@@ -5,12 +5,14 @@ use crate::depth_from::{DepthSource, RenderedDepth};
 use crate::methods::methods_of;
 use crate::read_progress::{OnReadProgress, ReadProgress};
 use crate::run_folder::is_recording;
+use crate::training_options::{AvailableData, MIN_IMAGES_PER_CAMERA};
 use capture::config::{Override, Rig};
 use capture::open::{self, Opened};
 use capture::{Join, JoinEvent, SampleUse, StationReport, Stations, dataset};
+use drivers::Sample;
 use keyframe::ensure;
 use keyframe::{Holdout, Keyframe, KeyframeList, Split, counted};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashSet};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -230,6 +232,19 @@ impl Data {
         self.keyframes.iter().map(key).zip(self.names.iter().cloned()).collect()
     }
 
+    /// What the data permit to estimate.
+    pub fn available(&self) -> AvailableData {
+        let n_cameras = self.keyframes.iter().map(|keyframe| &keyframe.camera).collect::<HashSet<_>>().len();
+        AvailableData {
+            joints: self.rig.is_some(),
+            drifts: self.rig.as_ref().is_none_or(Rig::has_moving_base),
+            // Depth rendered from reported camera poses contains no information about the true poses.
+            depth: self.has_depth() && self.rendered_depth.as_ref().is_none_or(|rendered| rendered.n_images == 0),
+            color_only: !self.has_depth(),
+            many_images_per_camera: self.keyframes.len() >= MIN_IMAGES_PER_CAMERA * n_cameras,
+        }
+    }
+
     /// Whether any keyframe has depth.
     pub fn has_depth(&self) -> bool {
         self.keyframes.iter().any(|keyframe| keyframe.depth.is_some())
@@ -285,7 +300,27 @@ impl Data {
         overrides: Vec<Override>,
         progress: OnReadProgress<'_>,
     ) -> crate::Result<Self> {
-        let Opened { rig, mut source, damage, .. } = open::recording(path, rig, &overrides)?;
+        Self::from_source(open::recording(path, rig, &overrides)?, list, |_| false, progress)
+    }
+
+    /// Joins the images of a rig's devices with poses until `is_end` returns true for a sample, or the devices end.
+    pub fn from_devices(
+        opened: Opened,
+        is_end: impl FnMut(&Sample) -> bool,
+        progress: OnReadProgress<'_>,
+    ) -> crate::Result<Self> {
+        let mut data = Self::from_source(opened, None, is_end, progress)?;
+        data.realign();
+        Ok(data)
+    }
+
+    fn from_source(
+        opened: Opened,
+        list: Option<KeyframeList>,
+        mut is_end: impl FnMut(&Sample) -> bool,
+        progress: OnReadProgress<'_>,
+    ) -> crate::Result<Self> {
+        let Opened { rig, mut source, damage, .. } = opened;
         let mut join = Join::new(&rig)?;
         if let Some(list) = list {
             join = join.taking_only(list);
@@ -304,6 +339,9 @@ impl Data {
             progress(ReadProgress { noun: "keyframes", n_done: keyframes.len(), n_all: None });
         };
         while let Some(sample) = source.next_sample()? {
+            if is_end(&sample) {
+                break;
+            }
             apply(join.push(sample));
         }
         apply(join.finish());

@@ -5,12 +5,11 @@ use crate::methods::{self, COUNT, MAX_SPLATS, Settings, methods_of};
 use crate::observer::Observer;
 use crate::recoveries::{OpenGpu, Recoveries};
 use crate::session::{Evaluators, Limits, Session};
-use crate::training_options::{AvailableData, MIN_IMAGES_PER_CAMERA, Refine, RefineSettings, TrainingOptions};
+use crate::training_options::{Refine, RefineSettings, TrainingOptions};
 use crate::{Error, run_folder, time_slices};
 use capture::Stop;
-use capture::config::{DEFAULT_SEED, Rig};
+use capture::config::DEFAULT_SEED;
 use keyframe::{Keyframe, listed};
-use std::collections::HashSet;
 use std::path::Path;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -104,15 +103,7 @@ pub fn model_specs(
     let rig_methods = data.rig.as_ref().map(methods_of).transpose()?;
     let kinds = rig_methods.or(options.methods.clone()).unwrap_or_else(|| vec![ModelKind::default()]);
     options.check_for(&kinds)?;
-    let n_cameras = data.keyframes.iter().map(|keyframe| &keyframe.camera).collect::<HashSet<_>>().len();
-    let available = AvailableData {
-        joints: data.rig.is_some(),
-        drifts: data.rig.as_ref().is_none_or(Rig::has_moving_base),
-        // Depth rendered from reported camera poses contains no information about the true poses.
-        depth: data.has_depth() && data.rendered_depth.as_ref().is_none_or(|rendered| rendered.n_images == 0),
-        color_only: !data.has_depth(),
-        many_images_per_camera: data.keyframes.len() >= MIN_IMAGES_PER_CAMERA * n_cameras,
-    };
+    let available = data.available();
     // On a CPU, no trials by default: each takes hundreds of additional steps, which take minutes.
     let RefineSettings { align, with_scene: cameras } =
         options.refining(available, if software { Refine::None } else { Refine::Auto })?;

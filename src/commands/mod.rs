@@ -1,6 +1,7 @@
 //! The subcommands, one file each.
 
 pub(crate) mod bench;
+pub(crate) mod calibrate;
 pub(crate) mod devices;
 pub(crate) mod doctor;
 pub(crate) mod eval;

@@ -121,6 +121,9 @@ pub struct ScalarEstimate {
 pub struct Unobservable {
     /// Descriptions of the parts.
     pub parts: Vec<String>,
+    /// Whether it changes only extrinsics of cameras.
+    #[serde(default)]
+    pub only_extrinsics: bool,
 }
 
 pub(super) fn alignment(
@@ -296,7 +299,9 @@ fn describe(scene: &AlignmentScene, params: &[CalibrationParam], direction: &DVe
             _ => None,
         });
     }
-    Unobservable { parts }
+    let is_extrinsics = |ix: usize| matches!(params[ix], CalibrationParam::Extrinsics(..));
+    let only_extrinsics = (0..params.len()).all(|ix| is_extrinsics(ix) || !is_significant(ix, 1));
+    Unobservable { parts, only_extrinsics }
 }
 
 impl Alignment {
