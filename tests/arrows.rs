@@ -5,12 +5,13 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::process::Command;
 
 /// Every crate, and the workspace crates that it may depend on.
-const ALLOWED: [(&str, &[&str]); 11] = [
+const ALLOWED: [(&str, &[&str]); 12] = [
     ("kinematics", &[]),
     ("keyframe", &["kinematics"]),
     ("calibration", &["keyframe", "kinematics"]),
     ("drivers", &["kinematics"]),
     ("sim", &["drivers", "kinematics"]),
+    ("targets", &["kinematics"]),
     ("capture", &["calibration", "drivers", "keyframe", "kinematics", "sim"]),
     ("trainer", &["calibration", "keyframe", "kinematics"]),
     ("viz", &["keyframe", "kinematics", "trainer"]),
@@ -18,7 +19,19 @@ const ALLOWED: [(&str, &[&str]); 11] = [
     ("bench", &["calibration", "capture", "keyframe", "kinematics", "session", "trainer"]),
     (
         "fieldrig",
-        &["bench", "calibration", "capture", "drivers", "keyframe", "kinematics", "session", "sim", "trainer", "viz"],
+        &[
+            "bench",
+            "calibration",
+            "capture",
+            "drivers",
+            "keyframe",
+            "kinematics",
+            "session",
+            "sim",
+            "targets",
+            "trainer",
+            "viz",
+        ],
     ),
 ];
 

@@ -11,7 +11,7 @@ use syn::visit::Visit;
 use syn::{Attribute, Item, UseTree};
 
 /// Source folders of the crates, relative to the workspace.
-const ROOTS: [&str; 11] = [
+const ROOTS: [&str; 12] = [
     "kinematics/src",
     "keyframe/src",
     "calibration/src",
@@ -21,6 +21,7 @@ const ROOTS: [&str; 11] = [
     "trainer/src",
     "viz/src",
     "session/src",
+    "targets/src",
     "bench/src",
     "src",
 ];

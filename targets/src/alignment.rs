@@ -1,0 +1,54 @@
+//! Aligns the corners of a lattice with the printed board.
+
+use crate::gray::Plane;
+use crate::lattice::{Cell, Lattice};
+use crate::surface::Surface;
+use crate::template::{self, Neighborhood};
+use std::collections::BTreeMap;
+
+/// The board that a lattice is on.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Printed<'a> {
+    pub(crate) surface: Surface<'a>,
+    pub(crate) square_m: f64,
+    /// Position of the corner of cell (0, 0) in the board frame, meters.
+    pub(crate) first_m: [f64; 2],
+    /// See [`Neighborhood::side_m`].
+    pub(crate) side_m: f64,
+}
+
+impl Printed<'_> {
+    /// Aligns all corners. Corners where this fails stay as they are.
+    pub(crate) fn align(&self, plane: &Plane, lattice: &mut Lattice) {
+        let aligned = self.aligned(plane, lattice);
+        lattice.corners.iter_mut().for_each(|(cell, pixel)| *pixel = aligned[cell].unwrap_or(*pixel));
+    }
+
+    /// Aligns all corners. Corners where this fails are removed.
+    pub(crate) fn align_strictly(&self, plane: &Plane, lattice: &mut Lattice) {
+        let aligned = self.aligned(plane, lattice);
+        lattice.corners = aligned.into_iter().filter_map(|(cell, pixel)| Some((cell, pixel?))).collect();
+    }
+
+    /// Positions of all corners after alignment. `None` where this fails.
+    fn aligned(&self, plane: &Plane, lattice: &Lattice) -> BTreeMap<Cell, Option<[f64; 2]>> {
+        let aligned = |(&cell, &pixel): (&Cell, &[f64; 2])| {
+            let neighborhood = |pixel_by_point| Neighborhood {
+                point_m: self.point_m(cell),
+                pixel,
+                pixel_by_point,
+                bend: lattice.bend(cell, pixel, self.square_m),
+                side_m: self.side_m,
+                reach_px: None,
+            };
+            let pixel_by_point = lattice.pixel_by_point(cell, pixel, self.square_m);
+            (cell, pixel_by_point.and_then(|map| template::find(plane, &self.surface, &neighborhood(map))))
+        };
+        lattice.corners.iter().map(aligned).collect()
+    }
+
+    /// Position of a corner in the board frame, meters.
+    pub(crate) fn point_m(&self, cell: Cell) -> [f64; 2] {
+        [0, 1].map(|axis| self.first_m[axis] + f64::from(cell[axis]) * self.square_m)
+    }
+}

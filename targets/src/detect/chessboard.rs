@@ -1,0 +1,180 @@
+//! Detection of chessboards.
+
+use super::{Detection, MIN_CORNERS};
+use crate::alignment::Printed;
+use crate::error::{Counts, NotDetected};
+use crate::gray::Plane;
+use crate::grid;
+use crate::lattice::{Cell, Lattice, Refinement, STEPS};
+use crate::saddle::{self, angle_between};
+use crate::spec::TargetSpec;
+
+/// Images with more pixels are first searched at half resolution.
+const HALVE_ABOVE_PX: usize = 3_000_000;
+/// Number of resolutions that are searched.
+const N_LEVELS: usize = 3;
+/// A row or column belongs to the board if it has at least this part of its corners.
+const MIN_LINE_FRAC: f64 = 0.5;
+/// A board is used if at least these percent of its corners are found.
+const MIN_CORNER_PERCENT: usize = 60;
+
+/// Squares are empty.
+const REFINEMENT: Refinement = Refinement { clear_frac: 0.5 };
+
+/// Resolutions of an image that are searched, with the size of their pixels.
+pub(super) struct Levels {
+    planes: Vec<(Plane, f64)>,
+}
+
+impl Levels {
+    pub(super) fn new(plane: &Plane) -> Self {
+        let mut planes = vec![(plane.smoothed(), 1.0)];
+        let mut halved = plane.clone();
+        while planes.len() < N_LEVELS && halved.can_be_halved() {
+            halved = halved.halved();
+            let scale = planes[planes.len() - 1].1 * 2.0;
+            planes.push((halved.smoothed(), scale));
+        }
+        let [width, height] = plane.size();
+        if width * height > HALVE_ABOVE_PX && planes.len() > 1 {
+            planes.swap(0, 1);
+        }
+        Self { planes }
+    }
+
+    /// The largest grid at each resolution, with pixels of the full image.
+    pub(super) fn grids(&self) -> impl Iterator<Item = Lattice> {
+        self.planes.iter().filter_map(|(plane, scale)| {
+            let saddles = saddle::find(plane);
+            let mut grid = grid::link(plane, &saddles, MIN_CORNERS).into_iter().next()?;
+            grid.corners.values_mut().for_each(|pixel| *pixel = pixel.map(|value| value * scale));
+            Some(grid)
+        })
+    }
+}
+
+/// Finds a chessboard with `inner` columns and rows of inner corners.
+pub(super) fn detect(
+    target: &TargetSpec,
+    inner: [u32; 2],
+    square_m: f64,
+    plane: &Plane,
+) -> Result<Detection, NotDetected> {
+    let smoothed = plane.smoothed();
+    let mut failure = NotDetected::Nothing { target: target.kind() };
+    let mut n_best = 0;
+    for mut grid in Levels::new(plane).grids() {
+        match matching(&mut grid, inner, &smoothed) {
+            Ok(mut lattice) => {
+                let surface = target.surface();
+                Printed { surface, square_m, first_m: [0.0; 2], side_m: square_m }.align(plane, &mut lattice);
+                let id = |cell: Cell| Some(u32::try_from(cell[1]).ok()? * inner[0] + u32::try_from(cell[0]).ok()?);
+                let pixels = lattice.corners.iter().filter_map(|(&cell, &pixel)| Some((id(cell)?, pixel)));
+                return Ok(target.detection(pixels, false));
+            }
+            Err(reason) if grid.corners.len() > n_best => {
+                n_best = grid.corners.len();
+                failure = reason;
+            }
+            Err(_) => {}
+        }
+    }
+    Err(failure)
+}
+
+/// Refines a grid and renumbers its corners as those of the board.
+fn matching(lattice: &mut Lattice, inner: [u32; 2], plane: &Plane) -> Result<Lattice, NotDetected> {
+    // Lines at the edge of the board may have been missed.
+    const GROWN_LINES: i32 = 1;
+    if let Some([low, high]) = lattice.range() {
+        let is_smaller = (high[0] - low[0] + 1) * (high[1] - low[1] + 1) < (inner[0] * inner[1]).cast_signed();
+        let grown = if is_smaller { GROWN_LINES } else { 0 };
+        lattice.complete(plane, [low.map(|value| value - grown), high.map(|value| value + grown)], REFINEMENT);
+    }
+    lattice.refine(plane, REFINEMENT);
+    lattice.remove_outliers();
+    trim(lattice);
+    let nothing = NotDetected::Nothing { target: "chessboard" };
+    let [low, high] = lattice.range().ok_or(nothing)?;
+    let size = [high[0] - low[0] + 1, high[1] - low[1] + 1].map(i32::cast_unsigned);
+    if size != inner && size != [inner[1], inner[0]] {
+        return Err(wrong_size(lattice, size, inner, plane));
+    }
+    let expected = (inner[0] * inner[1]) as usize;
+    let min = (expected * MIN_CORNER_PERCENT).div_ceil(100);
+    if lattice.corners.len() < min {
+        return Err(NotDetected::TooFewCorners { found: lattice.corners.len(), min });
+    }
+    let is_odd = (inner[0] + inner[1]) % 2 == 1;
+    let candidates = (0..4).filter(|&turns| inner == if turns % 2 == 0 { size } else { [size[1], size[0]] });
+    let oriented = candidates.filter_map(|turns| {
+        let corner =
+            [if turns == 1 || turns == 2 { high[0] } else { low[0] }, if turns >= 2 { high[1] } else { low[1] }];
+        // The square at the upper left of the board's first corner is black. Without rotation, it is the one that
+        // the grid counts as upper left, and colors alternate. Rotations by 90 degrees look at another square.
+        let is_black = (corner[0] + corner[1] + turns).rem_euclid(2) == 0;
+        (!is_odd || is_black).then_some((turns, corner))
+    });
+    let oriented = oriented.map(|(turns, corner)| renumber(lattice, corner, turns as usize));
+    let from_right = |lattice: &Lattice| x_axis_rad(lattice).map_or(f64::INFINITY, f64::abs);
+    let best = oriented.min_by(|a, b| from_right(a).total_cmp(&from_right(b)));
+    best.ok_or(NotDetected::Nothing { target: "chessboard" })
+}
+
+/// Removes outermost lines that have few corners: these are not part of the board.
+pub(super) fn trim(lattice: &mut Lattice) {
+    while let Some([low, high]) = lattice.range() {
+        let line = |axis: usize, at: i32| {
+            let n = lattice.corners.keys().filter(|cell| cell[axis] == at).count();
+            (n as f64 / f64::from(high[1 - axis] - low[1 - axis] + 1), axis, at)
+        };
+        let lines = [line(0, low[0]), line(0, high[0]), line(1, low[1]), line(1, high[1])];
+        let weakest = lines.into_iter().min_by(|a, b| a.0.total_cmp(&b.0));
+        match weakest {
+            Some((frac, axis, at)) if frac < MIN_LINE_FRAC => lattice.corners.retain(|cell, _| cell[axis] != at),
+            _ => return,
+        }
+    }
+}
+
+/// The cells seen from a corner, with the x axis along `STEPS[turns]`.
+fn renumber(lattice: &Lattice, corner: Cell, turns: usize) -> Lattice {
+    let (x, y) = (STEPS[turns], STEPS[(turns + 1) % 4]);
+    let cell = |cell: &Cell| {
+        let offset = [cell[0] - corner[0], cell[1] - corner[1]];
+        [offset[0] * x[0] + offset[1] * x[1], offset[0] * y[0] + offset[1] * y[1]]
+    };
+    Lattice { corners: lattice.corners.iter().map(|(at, &pixel)| (cell(at), pixel)).collect() }
+}
+
+/// Direction of the board's x axis in the image, from the pair of corners farthest apart in any row.
+fn x_axis_rad(lattice: &Lattice) -> Option<f64> {
+    let mut sum = [0.0; 2];
+    for (cell, pixel) in &lattice.corners {
+        if let Some(next) = lattice.corners.get(&[cell[0] + 1, cell[1]]) {
+            sum = [sum[0] + next[0] - pixel[0], sum[1] + next[1] - pixel[1]];
+        }
+    }
+    (sum != [0.0; 2]).then(|| angle_between(sum[1].atan2(sum[0]), 0.0))
+}
+
+/// The board is of another size, or a part of it is outside the image.
+fn wrong_size(lattice: &Lattice, size: [u32; 2], inner: [u32; 2], plane: &Plane) -> NotDetected {
+    // Columns are the longer side of the target, in the message only.
+    let is_swapped = (size[0] < size[1]) != (inner[0] < inner[1]);
+    let [columns, rows] = if is_swapped { [size[1], size[0]] } else { size };
+    let (found, expected) = (Counts { columns, rows }, Counts { columns: inner[0], rows: inner[1] });
+    let is_at_border = |(cell, pixel): (&Cell, &[f64; 2])| {
+        let spacing_px = lattice.spacing_px(*cell).unwrap_or(0.0);
+        !plane.contains(*pixel, 1.5 * spacing_px)
+    };
+    let is_smaller = columns <= inner[0] && rows <= inner[1];
+    const MIN_SIDE: u32 = 3;
+    if size.iter().any(|&side| side < MIN_SIDE) {
+        NotDetected::Nothing { target: "chessboard" }
+    } else if is_smaller && lattice.corners.iter().any(is_at_border) {
+        NotDetected::Partial { found, expected }
+    } else {
+        NotDetected::OtherSize { found, expected }
+    }
+}

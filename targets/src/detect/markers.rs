@@ -1,0 +1,101 @@
+//! Detection of ChArUco boards, AprilGrids and single tags, starting from their markers.
+
+use super::{Detection, MIN_CORNERS, charuco, diagnosis};
+use crate::dictionary::Dictionary;
+use crate::error::NotDetected;
+use crate::gray::Plane;
+use crate::homography::Homography;
+use crate::lattice::distance;
+use crate::layout::{self, Fit, layouts};
+use crate::marker::{self, Marker, UNIT_SQUARE};
+use crate::quad::{self, Quad, shortest_side};
+use crate::spec::{Pattern, TargetSpec};
+use crate::template::{self, Neighborhood};
+
+/// Widths of the black border of tags, in cells: Kalibr prints 2, AprilTag 1.
+const TAG_BORDERS: [usize; 2] = [1, 2];
+/// Largest distance of a corner from the intersection of the tag's sides, relative to the side: lenses bend them.
+const MAX_MOVE_FRAC: f64 = 0.04;
+
+/// Finds a ChArUco board, an AprilGrid or a tag.
+pub(super) fn detect(target: &TargetSpec, plane: &Plane) -> Result<Detection, NotDetected> {
+    let quads = quad::find(plane, matches!(target.pattern, Pattern::Aprilgrid { .. }));
+    let (dictionary, borders): (Dictionary, &[usize]) = match target.pattern {
+        Pattern::Charuco { dictionary, .. } => (dictionary, &[1]),
+        _ => (Dictionary::tag36h11(), &TAG_BORDERS),
+    };
+    let markers = marker::decode(plane, &quads, &dictionary, borders);
+    if let Pattern::Tag { id, side_m } = target.pattern {
+        return tag(target, id, side_m, plane, &markers)
+            .ok_or_else(|| diagnosis::markers(target, plane, &quads, &dictionary, &markers));
+    }
+    let fit = layout::fit(layouts(&target.pattern), &markers)
+        .ok_or_else(|| diagnosis::markers(target, plane, &quads, &dictionary, &markers))?;
+    let pixels = match target.pattern {
+        Pattern::Charuco { .. } => charuco::corners(target, plane, &fit),
+        Pattern::Aprilgrid { tag_m, .. } => aprilgrid(target, tag_m, plane, &fit),
+        _ => Vec::new(),
+    };
+    if pixels.len() < MIN_CORNERS {
+        return Err(NotDetected::TooFewCorners { found: pixels.len(), min: MIN_CORNERS });
+    }
+    Ok(target.detection(pixels, fit.layout.is_legacy))
+}
+
+/// Corners of the largest tag with an id.
+fn tag(target: &TargetSpec, id: u32, side_m: f64, plane: &Plane, markers: &[Marker]) -> Option<Detection> {
+    let of_id = markers.iter().filter(|marker| marker.id == id);
+    let largest = of_id.max_by(|a, b| shortest_side(&a.corners_px).total_cmp(&shortest_side(&b.corners_px)))?;
+    let corners_m = UNIT_SQUARE.map(|corner| corner.map(|frac| (frac - 0.5) * side_m));
+    Some(target.detection(corners(target, plane, largest, &corners_m, [0, 1, 2, 3], side_m), false))
+}
+
+/// Corners of all tags of an AprilGrid.
+fn aprilgrid(target: &TargetSpec, tag_m: f64, plane: &Plane, fit: &Fit) -> Vec<(u32, [f64; 2])> {
+    let of_marker = |marker: &Marker| {
+        let ids = [0, 1, 2, 3].map(|corner| 4 * marker.id + corner);
+        corners(target, plane, marker, &fit.layout.corners_m[marker.id as usize], ids, tag_m)
+    };
+    fit.markers.iter().flat_map(of_marker).collect()
+}
+
+/// Refines the corners of a marker. `corners_m`: their positions on the board, in the order of the marker.
+fn corners(
+    target: &TargetSpec,
+    plane: &Plane,
+    marker: &Marker,
+    corners_m: &Quad,
+    ids: [u32; 4],
+    side_m: f64,
+) -> Vec<(u32, [f64; 2])> {
+    // The border of a tag and the squares between tags are the same for all tags and for this part of the side.
+    const CLEAR_FRAC: f64 = 0.28;
+    let center_m = layout::center(corners_m);
+    let centered = corners_m.map(|corner| [corner[0] - center_m[0], corner[1] - center_m[1]]);
+    let mut corners_px = marker.corners_px;
+    let mut is_found = [false; 4];
+    // Sides bent by the lens displace the corners; the second time, scale and rotation are more accurate.
+    for reach_frac in [MAX_MOVE_FRAC, MAX_MOVE_FRAC / 4.0] {
+        let Some(pixel_from_board) = Homography::from_corners(&centered, &corners_px) else { return Vec::new() };
+        for at in 0..4 {
+            let neighborhood = Neighborhood {
+                point_m: corners_m[at],
+                pixel: corners_px[at],
+                pixel_by_point: pixel_from_board.jacobian(centered[at]),
+                bend: [[0.0; 2]; 3],
+                side_m: CLEAR_FRAC * side_m,
+                reach_px: Some((reach_frac * shortest_side(&marker.corners_px)).clamp(1.5, 4.0)),
+            };
+            let found = template::find(plane, &target.surface(), &neighborhood);
+            is_found[at] = found.is_some();
+            corners_px[at] = found.unwrap_or(corners_px[at]);
+        }
+    }
+    let id = |at: usize| {
+        let is_here = |id: &u32| {
+            target.corner(*id).is_some_and(|corner| distance([corner.x, corner.y], corners_m[at]) < 1e-6 * side_m)
+        };
+        ids.into_iter().find(is_here)
+    };
+    (0..4).filter(|&at| is_found[at]).filter_map(|at| Some((id(at)?, corners_px[at]))).collect()
+}

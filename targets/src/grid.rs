@@ -1,0 +1,206 @@
+//! Links saddles along the edges between them into lattices.
+//!
+//! Every saddle looks for the nearest saddle along each of its four edges; links that both ends agree on are kept if
+//! the image is black on one side and white on the other all along. The links are then walked, which gives every
+//! saddle a column and a row. All decisions are local, so the lens may bend the board. Similar to Geiger et al. 2012,
+//! "Automatic camera and range sensor calibration using a single shot", section III.
+
+use crate::gray::Plane;
+use crate::lattice::{Cell, Lattice, STEPS, distance};
+use crate::saddle::{Saddle, angle_between};
+use std::collections::VecDeque;
+
+/// Largest angle between an edge and the line to the neighbor, radians.
+const MAX_ANGLE_RAD: f64 = 0.4;
+/// Length of neighboring links relative to each other.
+const MAX_RATIO: f64 = 2.5;
+
+/// Links saddles. Returns the lattices with at least `min` corners, the largest first.
+///
+/// The square between corners `(0, 0)` and `(-1, -1)` is black, and colors alternate.
+pub(crate) fn link(plane: &Plane, saddles: &[Saddle], min: usize) -> Vec<Lattice> {
+    let links = links(plane, saddles);
+    let mut is_used = vec![false; saddles.len()];
+    let mut grids = Vec::new();
+    for seed in 0..saddles.len() {
+        if is_used[seed] || links[seed].iter().flatten().count() < 2 {
+            continue;
+        }
+        let grid = walk(saddles, &links, seed, &mut is_used);
+        if grid.corners.len() >= min {
+            grids.push(grid);
+        }
+    }
+    grids.sort_by_key(|grid| std::cmp::Reverse(grid.corners.len()));
+    grids
+}
+
+/// Neighbor of a saddle along one of its edges, and the index of the edge of the neighbor that leads back.
+type Link = Option<(usize, usize)>;
+
+fn links(plane: &Plane, saddles: &[Saddle]) -> Vec<[Link; 4]> {
+    let buckets = Buckets::new(saddles);
+    let nearest: Vec<[Link; 4]> = (0..saddles.len())
+        .map(|from| std::array::from_fn(|edge| nearest_along(saddles, &buckets, from, edge)))
+        .collect();
+    let is_mutual = |from: usize, edge: usize, (to, back): (usize, usize)| nearest[to][back] == Some((from, edge));
+    let mut links = vec![[None; 4]; saddles.len()];
+    for (from, edges) in links.iter_mut().enumerate() {
+        for (edge, link) in edges.iter_mut().enumerate() {
+            *link = nearest[from][edge]
+                .filter(|&link| is_mutual(from, edge, link) && is_edge(plane, &saddles[from], edge, &saddles[link.0]));
+        }
+    }
+    // The check of the image is not symmetric in rounding, so links are compared once more.
+    let checked = links.clone();
+    for (from, edges) in links.iter_mut().enumerate() {
+        for (edge, link) in edges.iter_mut().enumerate() {
+            *link = link.filter(|&(to, back)| checked[to][back] == Some((from, edge)));
+        }
+    }
+    drop_odd_lengths(saddles, &mut links);
+    links
+}
+
+/// The nearest saddle along an edge that has an edge back, with black and white on the same sides.
+fn nearest_along(saddles: &[Saddle], buckets: &Buckets, from: usize, edge: usize) -> Link {
+    let origin = &saddles[from];
+    let is_candidate = |to: usize| {
+        let (dx, dy) = (saddles[to].pixel[0] - origin.pixel[0], saddles[to].pixel[1] - origin.pixel[1]);
+        let toward_rad = dy.atan2(dx);
+        if to == from || angle_between(toward_rad, origin.edges_rad[edge]).abs() > MAX_ANGLE_RAD {
+            return None;
+        }
+        let back_rad =
+            |back: usize| angle_between(toward_rad + std::f64::consts::PI, saddles[to].edges_rad[back]).abs();
+        // An edge with black after it, in ascending angles, is seen from its other end with black before it.
+        let back = [1 - edge % 2, 3 - edge % 2].into_iter().min_by(|&a, &b| back_rad(a).total_cmp(&back_rad(b)))?;
+        (back_rad(back) <= MAX_ANGLE_RAD).then_some(back)
+    };
+    buckets.nearest(saddles, origin.pixel, is_candidate)
+}
+
+/// Whether the image is black on one side of the line between two saddles and white on the other.
+fn is_edge(plane: &Plane, from: &Saddle, edge: usize, to: &Saddle) -> bool {
+    // Puzzleboards have a dot in the middle third of every edge, so its outer thirds are examined.
+    const ALONG: [f64; 4] = [0.2, 0.3, 0.7, 0.8];
+    const ACROSS: f64 = 0.12;
+    const MIN_CONTRAST_FRAC: f32 = 0.25;
+    let (dx, dy) = (to.pixel[0] - from.pixel[0], to.pixel[1] - from.pixel[1]);
+    let across_px = (ACROSS * dx.hypot(dy)).max(1.0) / dx.hypot(dy);
+    let black_sign = if edge.is_multiple_of(2) { 1.0 } else { -1.0 }; // Black is at ascending angles of even edges.
+    let contrast = from.contrast.min(to.contrast) * MIN_CONTRAST_FRAC;
+    ALONG.into_iter().all(|along| {
+        let center = [from.pixel[0] + along * dx, from.pixel[1] + along * dy];
+        let side = |sign: f64| [center[0] - sign * across_px * dy, center[1] + sign * across_px * dx];
+        plane.sample(side(-black_sign)) - plane.sample(side(black_sign)) > contrast
+    })
+}
+
+/// Removes links that are much longer than the other links of a saddle: they skip a missing corner or leave the board.
+fn drop_odd_lengths(saddles: &[Saddle], links: &mut [[Link; 4]]) {
+    let length = |from: usize, link: Link| link.map(|(to, _)| distance(saddles[from].pixel, saddles[to].pixel));
+    let shortest = |from: usize| links[from].iter().filter_map(|&link| length(from, link)).min_by(f64::total_cmp);
+    let shortest: Vec<f64> = (0..saddles.len()).map(|from| shortest(from).unwrap_or(f64::INFINITY)).collect();
+    for (from, edges) in links.iter_mut().enumerate() {
+        for link in edges {
+            let is_odd = |(to, _): (usize, usize)| {
+                let length = distance(saddles[from].pixel, saddles[to].pixel);
+                length > MAX_RATIO * shortest[from].min(shortest[to])
+            };
+            *link = link.filter(|&link| !is_odd(link));
+        }
+    }
+}
+
+/// Assigns columns and rows, starting at a saddle, which is at (0, 0). Its edge 0 leads to column 1, so the sector
+/// between its edges 2 and 3 is at the upper left, and black.
+fn walk(saddles: &[Saddle], links: &[[Link; 4]], seed: usize, is_used: &mut [bool]) -> Lattice {
+    let mut lattice = Lattice::default();
+    // Saddle, its cell, and the direction (index in STEPS) of its edge 0.
+    let mut queue = VecDeque::from([(seed, [0, 0], 0_usize)]);
+    is_used[seed] = true;
+    lattice.corners.insert([0, 0], saddles[seed].pixel);
+    while let Some((from, cell, first_step)) = queue.pop_front() {
+        for (edge, link) in links[from].iter().enumerate() {
+            let Some((to, back)) = *link else { continue };
+            let step = (edge + first_step) % 4;
+            let neighbor: Cell = [cell[0] + STEPS[step][0], cell[1] + STEPS[step][1]];
+            if is_used[to] || lattice.corners.contains_key(&neighbor) {
+                continue;
+            }
+            is_used[to] = true;
+            lattice.corners.insert(neighbor, saddles[to].pixel);
+            queue.push_back((to, neighbor, (step + 2 + 4 - back) % 4));
+        }
+    }
+    lattice
+}
+
+/// Saddles sorted into square buckets, for searches in growing rings.
+struct Buckets {
+    side_px: f64,
+    counts: [usize; 2],
+    buckets: Vec<Vec<usize>>,
+}
+
+impl Buckets {
+    fn new(saddles: &[Saddle]) -> Self {
+        const SIDE_PX: f64 = 24.0;
+        let bucket = |pixel: [f64; 2]| pixel.map(|value| index(value, SIDE_PX));
+        let mut counts = [1, 1];
+        for saddle in saddles {
+            let [column, row] = bucket(saddle.pixel);
+            counts = [counts[0].max(column + 1), counts[1].max(row + 1)];
+        }
+        let mut buckets = vec![Vec::new(); counts[0] * counts[1]];
+        for (ix, saddle) in saddles.iter().enumerate() {
+            let [column, row] = bucket(saddle.pixel);
+            buckets[row * counts[0] + column].push(ix);
+        }
+        Self { side_px: SIDE_PX, counts, buckets }
+    }
+
+    /// The nearest saddle for which `accept` returns a value, with this value.
+    fn nearest<T>(
+        &self,
+        saddles: &[Saddle],
+        pixel: [f64; 2],
+        accept: impl Fn(usize) -> Option<T>,
+    ) -> Option<(usize, T)> {
+        const MAX_RINGS: usize = 12;
+        let center = pixel.map(|value| index(value, self.side_px));
+        let mut best: Option<(f64, usize, T)> = None;
+        for ring in 0..=MAX_RINGS.min(self.counts[0].max(self.counts[1])) {
+            // Everything outside the rings searched so far is farther away than this.
+            let searched_px = (ring as f64 - 1.0) * self.side_px;
+            if best.as_ref().is_some_and(|best| best.0 < searched_px) {
+                break;
+            }
+            let range =
+                |axis: usize| center[axis].saturating_sub(ring)..=(center[axis] + ring).min(self.counts[axis] - 1);
+            for row in range(1) {
+                for column in range(0) {
+                    if row.abs_diff(center[1]).max(column.abs_diff(center[0])) != ring {
+                        continue;
+                    }
+                    for &ix in &self.buckets[row * self.counts[0] + column] {
+                        let away = distance(saddles[ix].pixel, pixel);
+                        if best.as_ref().is_some_and(|best| best.0 <= away) {
+                            continue;
+                        }
+                        if let Some(value) = accept(ix) {
+                            best = Some((away, ix, value));
+                        }
+                    }
+                }
+            }
+        }
+        best.map(|(_, ix, value)| (ix, value))
+    }
+}
+
+#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "positions are within the image")]
+fn index(value: f64, side_px: f64) -> usize {
+    (value.max(0.0) / side_px) as usize
+}

@@ -1,0 +1,225 @@
+//! Corners of a board on an integer lattice, with prediction of each corner from its neighbors.
+//!
+//! Predictions only use neighbors, never the whole board, so they hold for any lens.
+
+use crate::gray::Plane;
+use crate::saddle;
+use nalgebra::Matrix2;
+use std::collections::BTreeMap;
+
+/// Column and row.
+pub(crate) type Cell = [i32; 2];
+
+/// Image positions of corners by column and row, pixels.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub(crate) struct Lattice {
+    pub(crate) corners: BTreeMap<Cell, [f64; 2]>,
+}
+
+/// Largest deviation from a prediction, relative to the distance between neighbors.
+const MAX_DEVIATION: f64 = 0.22;
+/// Radius of the ring that verifies a corner, relative to the distance between neighbors.
+const RING_FRAC: f64 = 0.27;
+/// Half the refinement window, relative to the distance between neighbors, and its limits in pixels.
+const WINDOW_FRAC: f64 = 0.38;
+const WINDOW_PX: [f64; 2] = [2.0, 9.0];
+
+/// How corners are refined and verified.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Refinement {
+    /// Part of the distance between corners around each corner that shows nothing but the four edges, 0 to 0.5.
+    pub(crate) clear_frac: f64,
+}
+
+impl Lattice {
+    fn at(&self, cell: Cell, step: Cell, n: i32) -> Option<[f64; 2]> {
+        self.corners.get(&[cell[0] + n * step[0], cell[1] + n * step[1]]).copied()
+    }
+
+    /// Distance to the nearest neighbor, pixels.
+    pub(crate) fn spacing_px(&self, cell: Cell) -> Option<f64> {
+        let here = self.corners.get(&cell)?;
+        let neighbors = STEPS.iter().filter_map(|&step| self.at(cell, step, 1));
+        neighbors.map(|near| distance(*here, near)).min_by(f64::total_cmp)
+    }
+
+    /// Predicts a corner from its neighbors, without using the corner itself. Also returns the distance between
+    /// neighbors there.
+    ///
+    /// The mean of all predictions of the most accurate kind is used: between two neighbors; extrapolation of a
+    /// parabola; completion of a square; linear extrapolation.
+    pub(crate) fn predict(&self, cell: Cell) -> Option<Prediction> {
+        let between = |step: Cell| {
+            let (a, b) = (self.at(cell, step, 1)?, self.at(cell, step, -1)?);
+            Some(Prediction { pixel: combine(&[(0.5, a), (0.5, b)]), spacing_px: distance(a, b) / 2.0 })
+        };
+        let square = |at: usize| {
+            let (step, turned) = (STEPS[at], STEPS[(at + 1) % 4]);
+            let (a, b) = (self.at(cell, step, 1)?, self.at(cell, turned, 1)?);
+            let diagonal = self.at([cell[0] + step[0], cell[1] + step[1]], turned, 1)?;
+            let spacing_px = distance(a, diagonal).min(distance(b, diagonal));
+            Some(Prediction { pixel: combine(&[(1.0, a), (1.0, b), (-1.0, diagonal)]), spacing_px })
+        };
+        let parabola = |at: usize| {
+            let [a, b, c] = [1, 2, 3].map(|n| self.at(cell, STEPS[at], n));
+            let (a, b, c) = (a?, b?, c?);
+            Some(Prediction { pixel: combine(&[(3.0, a), (-3.0, b), (1.0, c)]), spacing_px: distance(a, b) })
+        };
+        let line = |at: usize| {
+            let (a, b) = (self.at(cell, STEPS[at], 1)?, self.at(cell, STEPS[at], 2)?);
+            Some(Prediction { pixel: combine(&[(2.0, a), (-1.0, b)]), spacing_px: distance(a, b) })
+        };
+        mean(STEPS[..2].iter().filter_map(|&step| between(step)))
+            .or_else(|| mean((0..4).filter_map(parabola)))
+            .or_else(|| mean((0..4).filter_map(square)))
+            .or_else(|| mean((0..4).filter_map(line)))
+    }
+
+    /// Derivative of the pixel with respect to the point on the board (pixels per meter) at a cell whose corner is at
+    /// `pixel`, from the cell's neighbors. `None` if it has none along an axis.
+    pub(crate) fn pixel_by_point(&self, cell: Cell, pixel: [f64; 2], square_m: f64) -> Option<Matrix2<f64>> {
+        // Of second order if possible: of a parabola through three corners.
+        let one_sided = |step: Cell, sign: i32| {
+            let (near, far) = (self.at(cell, step, sign)?, self.at(cell, step, 2 * sign));
+            let ahead = match far {
+                Some(far) => combine(&[(2.0, near), (-1.5, pixel), (-0.5, far)]),
+                None => combine(&[(1.0, near), (-1.0, pixel)]),
+            };
+            Some(ahead.map(|value| value * f64::from(sign)))
+        };
+        let along = |step: Cell| match (self.at(cell, step, -1), self.at(cell, step, 1)) {
+            (Some(before), Some(after)) => Some(combine(&[(0.5, after), (-0.5, before)])),
+            _ => one_sided(step, 1).or_else(|| one_sided(step, -1)),
+        };
+        let [x, y] = [along(STEPS[0])?, along(STEPS[1])?];
+        Some(Matrix2::new(x[0], y[0], x[1], y[1]) / square_m)
+    }
+
+    /// Second derivatives of the pixel with respect to x and x, x and y, y and y, pixels per square meter, from the
+    /// neighbors of a cell; zero where there are too few.
+    pub(crate) fn bend(&self, cell: Cell, pixel: [f64; 2], square_m: f64) -> [[f64; 2]; 3] {
+        let straight = |step: Cell| {
+            let (before, after) = (self.at(cell, step, -1)?, self.at(cell, step, 1)?);
+            Some(combine(&[(1.0, after), (1.0, before), (-2.0, pixel)]))
+        };
+        let diagonal = |x: i32, y: i32| {
+            let (a, b) = (self.at(cell, [x, 0], 1)?, self.at(cell, [0, y], 1)?);
+            let twist = combine(&[(1.0, self.at(cell, [x, y], 1)?), (1.0, pixel), (-1.0, a), (-1.0, b)]);
+            Some(twist.map(|value| value * f64::from(x * y)))
+        };
+        let twists: Vec<[f64; 2]> =
+            [[1, 1], [1, -1], [-1, 1], [-1, -1]].into_iter().filter_map(|[x, y]| diagonal(x, y)).collect();
+        let mean = [0, 1].map(|axis| twists.iter().map(|twist| twist[axis]).sum::<f64>() / twists.len().max(1) as f64);
+        [straight(STEPS[0]).unwrap_or_default(), mean, straight(STEPS[1]).unwrap_or_default()]
+            .map(|second| second.map(|value| value / (square_m * square_m)))
+    }
+
+    /// Adds corners that are missing inside `range` (inclusive) where a saddle lies close to its prediction, repeatedly.
+    pub(crate) fn complete(&mut self, plane: &Plane, range: [Cell; 2], refinement: Refinement) {
+        let max_passes = range[1][0] - range[0][0] + range[1][1] - range[0][1] + 2;
+        for _ in 0..max_passes {
+            let mut added = Vec::new();
+            for row in range[0][1]..=range[1][1] {
+                for column in range[0][0]..=range[1][0] {
+                    let cell = [column, row];
+                    if self.corners.contains_key(&cell) {
+                        continue;
+                    }
+                    let corner = self.predict(cell).and_then(|prediction| prediction.find(plane, refinement));
+                    added.extend(corner.map(|pixel| (cell, pixel)));
+                }
+            }
+            if added.is_empty() {
+                return;
+            }
+            self.corners.extend(added);
+        }
+    }
+
+    /// Refines all corners and removes those that are no saddles.
+    pub(crate) fn refine(&mut self, plane: &Plane, refinement: Refinement) {
+        let refined = self.corners.iter().filter_map(|(&cell, &pixel)| {
+            let spacing_px = self.spacing_px(cell).or_else(|| Some(self.predict(cell)?.spacing_px))?;
+            Some((cell, refinement.refine(plane, pixel, spacing_px)?))
+        });
+        self.corners = refined.collect();
+    }
+
+    /// Removes corners that deviate from the predictions of their neighbors, the worst first.
+    pub(crate) fn remove_outliers(&mut self) {
+        loop {
+            let deviation = |(&cell, &pixel): (&Cell, &[f64; 2])| {
+                let prediction = self.predict(cell)?;
+                Some((cell, distance(pixel, prediction.pixel) / prediction.spacing_px))
+            };
+            let worst = self.corners.iter().filter_map(deviation).max_by(|a, b| a.1.total_cmp(&b.1));
+            match worst {
+                Some((cell, deviation)) if deviation > MAX_DEVIATION => self.corners.remove(&cell),
+                _ => return,
+            };
+        }
+    }
+
+    /// Smallest and largest column and row. `None` if there are no corners.
+    pub(crate) fn range(&self) -> Option<[Cell; 2]> {
+        let mut cells = self.corners.keys();
+        let first = *cells.next()?;
+        let grown = |[low, high]: [Cell; 2], cell: &Cell| {
+            [[low[0].min(cell[0]), low[1].min(cell[1])], [high[0].max(cell[0]), high[1].max(cell[1])]]
+        };
+        Some(cells.fold([first, first], grown))
+    }
+}
+
+/// A predicted corner.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Prediction {
+    pub(crate) pixel: [f64; 2],
+    /// Distance between neighbors, pixels.
+    pub(crate) spacing_px: f64,
+}
+
+impl Prediction {
+    /// Finds the saddle at this prediction.
+    pub(crate) fn find(&self, plane: &Plane, refinement: Refinement) -> Option<[f64; 2]> {
+        let reach_px = (MAX_DEVIATION * self.spacing_px).max(1.0);
+        let radius_px = refinement.ring_px(self.spacing_px);
+        let saddle = saddle::find_near(plane, self.pixel, reach_px, radius_px)?;
+        let pixel = refinement.refine(plane, saddle.pixel, self.spacing_px)?;
+        (distance(pixel, self.pixel) <= reach_px + 0.5).then_some(pixel)
+    }
+}
+
+impl Refinement {
+    fn ring_px(self, spacing_px: f64) -> f64 {
+        (spacing_px * RING_FRAC.min(self.clear_frac)).max(1.5)
+    }
+
+    /// Refines a corner and checks that it still is a saddle.
+    fn refine(self, plane: &Plane, start: [f64; 2], spacing_px: f64) -> Option<[f64; 2]> {
+        let half_window_px = (spacing_px * WINDOW_FRAC.min(self.clear_frac)).clamp(WINDOW_PX[0], WINDOW_PX[1]);
+        let pixel = saddle::refine(plane, start, half_window_px)?;
+        saddle::ring(plane, pixel, self.ring_px(spacing_px)).map(|_| pixel)
+    }
+}
+
+/// Right, down, left, up.
+pub(crate) const STEPS: [Cell; 4] = [[1, 0], [0, 1], [-1, 0], [0, -1]];
+
+fn combine(parts: &[(f64, [f64; 2])]) -> [f64; 2] {
+    [0, 1].map(|axis| parts.iter().map(|(weight, pixel)| weight * pixel[axis]).sum())
+}
+
+fn mean(predictions: impl Iterator<Item = Prediction>) -> Option<Prediction> {
+    let (mut sum, mut spacing_px, mut n) = ([0.0; 2], 0.0, 0.0);
+    for prediction in predictions {
+        sum = [sum[0] + prediction.pixel[0], sum[1] + prediction.pixel[1]];
+        spacing_px += prediction.spacing_px;
+        n += 1.0;
+    }
+    (n > 0.0).then(|| Prediction { pixel: sum.map(|sum| sum / n), spacing_px: spacing_px / n })
+}
+
+pub(crate) fn distance(a: [f64; 2], b: [f64; 2]) -> f64 {
+    (a[0] - b[0]).hypot(a[1] - b[1])
+}

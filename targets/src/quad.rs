@@ -1,0 +1,285 @@
+//! Finds dark convex quadrilaterals: outlines of dark regions after adaptive thresholding, approximated by polygons.
+
+use crate::gray::Plane;
+use crate::lattice::distance;
+
+/// Sides of the windows for the local mean, pixels.
+const WINDOWS_PX: [usize; 3] = [9, 23, 61];
+/// A pixel is dark if it is darker than the local mean by this much.
+const DARKER_BY: f32 = 5.0;
+/// Shortest side of a quadrilateral, pixels.
+const MIN_SIDE_PX: f64 = 6.0;
+/// Largest distance of an outline from its polygon, relative to the square root of the enclosed area.
+const TOLERANCE: f64 = 0.1;
+const MIN_TOLERANCE_PX: f64 = 1.2;
+
+/// Corners in the order clockwise as seen in the image, pixels.
+pub(crate) type Quad = [[f64; 2]; 4];
+
+/// Finds dark quadrilaterals. The same one may be found several times, with slightly different corners.
+///
+/// `do_touch`: whether corners of quadrilaterals touch other dark regions, as on AprilGrids.
+pub(crate) fn find(plane: &Plane, do_touch: bool) -> Vec<Quad> {
+    let sums = Sums::new(plane);
+    let mut quads = Vec::new();
+    for window_px in WINDOWS_PX {
+        let mut is_dark = threshold(plane, &sums, window_px);
+        let mut add = |outline: &[[i32; 2]]| quads.extend(quad(outline).map(|quad| refine(plane, quad)));
+        outlines(&is_dark, plane.size(), &mut add);
+        if do_touch {
+            erode(&mut is_dark, plane.size());
+            outlines(&is_dark, plane.size(), &mut add);
+        }
+    }
+    quads
+}
+
+/// Sums of all values above and left of each pixel corner.
+struct Sums {
+    stride: usize,
+    sums: Vec<f64>,
+}
+
+impl Sums {
+    fn new(plane: &Plane) -> Self {
+        let [width, height] = plane.size();
+        let stride = width + 1;
+        let mut sums = vec![0.0; stride * (height + 1)];
+        for y in 0..height {
+            let mut row_sum = 0.0;
+            for (x, value) in plane.row(y).iter().enumerate() {
+                row_sum += f64::from(*value);
+                sums[(y + 1) * stride + x + 1] = sums[y * stride + x + 1] + row_sum;
+            }
+        }
+        Self { stride, sums }
+    }
+}
+
+fn threshold(plane: &Plane, sums: &Sums, window_px: usize) -> Vec<bool> {
+    let [width, height] = plane.size();
+    let half = window_px / 2;
+    let mut is_dark = Vec::with_capacity(width * height);
+    for y in 0..height {
+        let (top, bottom) = (y.saturating_sub(half) * sums.stride, (y + half + 1).min(height) * sums.stride);
+        let n_rows = (bottom - top) / sums.stride;
+        for (x, &value) in plane.row(y).iter().enumerate() {
+            let (left, right) = (x.saturating_sub(half), (x + half + 1).min(width));
+            let sum =
+                sums.sums[bottom + right] - sums.sums[bottom + left] - sums.sums[top + right] + sums.sums[top + left];
+            let n = (n_rows * (right - left)) as f64;
+            is_dark.push(f64::from(value + DARKER_BY) * n < sum);
+        }
+    }
+    is_dark
+}
+
+/// Makes dark pixels with a bright neighbor bright, which separates regions that touch at a corner.
+fn erode(is_dark: &mut [bool], [width, height]: [usize; 2]) {
+    let before = is_dark.to_vec();
+    for y in 1..height - 1 {
+        for x in 1..width - 1 {
+            let at = y * width + x;
+            is_dark[at] = before[at] && before[at - 1] && before[at + 1] && before[at - width] && before[at + width];
+        }
+    }
+}
+
+/// Walks around every dark region (of pixels with common sides), on the borders between pixels, dark on the right.
+///
+/// Points are pixel corners, so the outline lies between dark and bright pixels. Holes are skipped.
+fn outlines(is_dark: &[bool], [width, height]: [usize; 2], mut visit: impl FnMut(&[[i32; 2]])) {
+    let dark = |x: i32, y: i32| {
+        let (Ok(x), Ok(y)) = (usize::try_from(x), usize::try_from(y)) else { return false };
+        x < width && y < height && is_dark[y * width + x]
+    };
+    let (Ok(n_columns), Ok(n_rows)) = (i32::try_from(width), i32::try_from(height)) else { return };
+    let mut is_visited = vec![false; width * height]; // Upper borders of dark pixels.
+    let mut outline = Vec::new();
+    for y in 0..n_rows {
+        for x in 0..n_columns {
+            let at = y.cast_unsigned() as usize * width + x.cast_unsigned() as usize;
+            if !is_dark[at] || is_visited[at] || dark(x, y - 1) {
+                continue;
+            }
+            outline.clear();
+            let (mut point, mut step) = ([x, y], 0_usize);
+            let mut twice_area = 0_i64;
+            loop {
+                outline.push(point);
+                if step == 0 {
+                    is_visited[point[1].cast_unsigned() as usize * width + point[0].cast_unsigned() as usize] = true;
+                }
+                let [dx, dy] = crate::lattice::STEPS[step];
+                let next = [point[0] + dx, point[1] + dy];
+                twice_area += i64::from(point[0]) * i64::from(next[1]) - i64::from(next[0]) * i64::from(point[1]);
+                point = next;
+                // The two pixels ahead, left and right of the walking direction.
+                let (left, right) = match step {
+                    0 => ([0, -1], [0, 0]),
+                    1 => ([0, 0], [-1, 0]),
+                    2 => ([-1, 0], [-1, -1]),
+                    _ => ([-1, -1], [0, -1]),
+                };
+                let is_dark_at = |offset: [i32; 2]| dark(point[0] + offset[0], point[1] + offset[1]);
+                step = match (is_dark_at(left), is_dark_at(right)) {
+                    (_, false) => (step + 1) % 4,
+                    (true, true) => (step + 3) % 4,
+                    (false, true) => step,
+                };
+                if point == [x, y] && step == 0 {
+                    break;
+                }
+            }
+            if twice_area as f64 > MIN_SIDE_PX * MIN_SIDE_PX {
+                visit(&outline);
+            }
+        }
+    }
+}
+
+/// Approximates an outline by four corners, clockwise. `None` if its shape is another one.
+fn quad(outline: &[[i32; 2]]) -> Option<Quad> {
+    let points: Vec<[f64; 2]> = outline.iter().map(|point| point.map(f64::from)).collect();
+    let area = area(&points);
+    let tolerance_px = (TOLERANCE * area.sqrt()).max(MIN_TOLERANCE_PX);
+    // Outlines of quadrilaterals are short compared to their area.
+    if points.len() as f64 > 12.0 * area.sqrt() {
+        return None;
+    }
+    let n = points.len();
+    let center = [0, 1].map(|axis| points.iter().map(|point| point[axis]).sum::<f64>() / n as f64);
+    let farthest =
+        |from: [f64; 2]| (0..n).max_by(|&a, &b| distance(points[a], from).total_cmp(&distance(points[b], from)));
+    let first = farthest(center)?;
+    let second = farthest(points[first])?;
+    let (low, high) = (first.min(second), first.max(second));
+    let mut corners = vec![low];
+    split(&points, low, high, tolerance_px, &mut corners);
+    corners.push(high);
+    split(&points, high, low + n, tolerance_px, &mut corners);
+    let corners: [usize; 4] = corners.try_into().ok()?;
+    let quad = corners.map(|at| points[at % n]);
+    let is_similar = (self::area(&quad) / area - 1.0).abs() < 0.3;
+    (is_similar && is_convex(&quad) && shortest_side(&quad) >= MIN_SIDE_PX).then_some(quad)
+}
+
+/// Appends the corners between two points of an outline (Ramer 1972, Douglas and Peucker 1973). Stops at five corners.
+fn split(points: &[[f64; 2]], from: usize, to: usize, tolerance_px: f64, corners: &mut Vec<usize>) {
+    let n = points.len();
+    let (a, b) = (points[from % n], points[to % n]);
+    let length = distance(a, b).max(1e-9);
+    let away = |at: usize| {
+        let point = points[at % n];
+        ((b[0] - a[0]) * (point[1] - a[1]) - (b[1] - a[1]) * (point[0] - a[0])).abs() / length
+    };
+    let Some(at) = (from + 1..to).max_by(|&a, &b| away(a).total_cmp(&away(b))) else { return };
+    if away(at) <= tolerance_px || corners.len() > 4 {
+        return;
+    }
+    split(points, from, at, tolerance_px, corners);
+    corners.push(at);
+    split(points, at, to, tolerance_px, corners);
+}
+
+/// Enclosed area; positive for clockwise outlines.
+fn area(points: &[[f64; 2]]) -> f64 {
+    let next = points.iter().cycle().skip(1);
+    points.iter().zip(next).map(|(a, b)| a[0] * b[1] - b[0] * a[1]).sum::<f64>() / 2.0
+}
+
+fn is_convex(quad: &Quad) -> bool {
+    (0..4).all(|at| {
+        let [a, b, c] = [0, 1, 2].map(|offset| quad[(at + offset) % 4]);
+        (b[0] - a[0]) * (c[1] - b[1]) - (b[1] - a[1]) * (c[0] - b[0]) > 0.0
+    })
+}
+
+pub(crate) fn shortest_side(quad: &Quad) -> f64 {
+    (0..4).map(|at| distance(quad[at], quad[(at + 1) % 4])).fold(f64::INFINITY, f64::min)
+}
+
+/// Moves the sides to the strongest change from dark to bright near them and intersects them.
+///
+/// Returns the quadrilateral unchanged if a side cannot be located or a corner moves far.
+fn refine(plane: &Plane, quad: Quad) -> Quad {
+    let max_move_px = (0.15 * shortest_side(&quad)).max(2.0);
+    let sides: [Option<Line>; 4] = std::array::from_fn(|at| fit_side(plane, quad[at], quad[(at + 1) % 4]));
+    let corner = |at: usize| Line::intersection(&sides[(at + 3) % 4]?, &sides[at]?);
+    let refined: [Option<[f64; 2]>; 4] = std::array::from_fn(corner);
+    let [Some(a), Some(b), Some(c), Some(d)] = refined else { return quad };
+    let refined = [a, b, c, d];
+    let is_near = (0..4).all(|at| distance(refined[at], quad[at]) <= max_move_px);
+    if is_near && is_convex(&refined) { refined } else { quad }
+}
+
+/// Points with `normal · point = offset`.
+#[derive(Clone, Copy, Debug)]
+struct Line {
+    normal: [f64; 2],
+    offset: f64,
+}
+
+impl Line {
+    fn intersection(a: &Self, b: &Self) -> Option<[f64; 2]> {
+        let determinant = a.normal[0] * b.normal[1] - a.normal[1] * b.normal[0];
+        let x = (a.offset * b.normal[1] - b.offset * a.normal[1]) / determinant;
+        let y = (b.offset * a.normal[0] - a.offset * b.normal[0]) / determinant;
+        (determinant.abs() > 1e-3).then_some([x, y])
+    }
+}
+
+/// Fits a line to the transition from dark to bright along a side; dark is on the right.
+fn fit_side(plane: &Plane, from: [f64; 2], to: [f64; 2]) -> Option<Line> {
+    const REACH_PX: f64 = 2.0;
+    const STEP_PX: f64 = 0.5;
+    let length = distance(from, to);
+    let along = [(to[0] - from[0]) / length, (to[1] - from[1]) / length];
+    let outward = [along[1], -along[0]];
+    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a small positive number")]
+    let n = (length as usize).clamp(4, 40);
+    let mut points: Vec<[f64; 2]> = Vec::with_capacity(n);
+    for at in 0..n {
+        // The ends are rounded by blur.
+        let frac = 0.12 + 0.76 * (at as f64 + 0.5) / n as f64;
+        let center = [0, 1].map(|axis| from[axis] + frac * (to[axis] - from[axis]));
+        let sample = |away: f64| f64::from(plane.sample([0, 1].map(|axis| center[axis] + away * outward[axis])));
+        let (mut weight_sum, mut sum) = (0.0, 0.0);
+        let mut away = -REACH_PX;
+        while away <= REACH_PX {
+            let rise = (sample(away + STEP_PX) - sample(away - STEP_PX)).max(0.0);
+            weight_sum += rise * rise;
+            sum += rise * rise * away;
+            away += STEP_PX;
+        }
+        if weight_sum > 25.0 {
+            let away = sum / weight_sum;
+            points.push([0, 1].map(|axis| center[axis] + away * outward[axis]));
+        }
+    }
+    if points.len() < 3 {
+        return None;
+    }
+    let line = fit_line(&points)?;
+    let off = |point: &[f64; 2]| (line.normal[0] * point[0] + line.normal[1] * point[1] - line.offset).abs();
+    let mut offs: Vec<f64> = points.iter().map(off).collect();
+    offs.sort_by(f64::total_cmp);
+    let allowed = (2.5 * offs[offs.len() / 2]).max(0.1);
+    points.retain(|point| off(point) <= allowed);
+    fit_line(&points)
+}
+
+/// Total least squares.
+fn fit_line(points: &[[f64; 2]]) -> Option<Line> {
+    if points.len() < 2 {
+        return None;
+    }
+    let n = points.len() as f64;
+    let mean = [0, 1].map(|axis| points.iter().map(|point| point[axis]).sum::<f64>() / n);
+    let moment =
+        |a: usize, b: usize| points.iter().map(|point| (point[a] - mean[a]) * (point[b] - mean[b])).sum::<f64>();
+    let (xx, xy, yy) = (moment(0, 0), moment(0, 1), moment(1, 1));
+    let direction_rad = (2.0 * xy).atan2(xx - yy) / 2.0;
+    let normal = [-direction_rad.sin(), direction_rad.cos()];
+    Some(Line { normal, offset: normal[0] * mean[0] + normal[1] * mean[1] })
+}

@@ -1,0 +1,198 @@
+//! Refines corners by comparing the image with the printed pattern around them.
+//!
+//! Where other edges are close to a corner, such as those of a marker with a narrow margin, the pattern around the
+//! corner is known but is no plain saddle. The pattern is rendered with the local scale, rotation and shear, and
+//! shifted until it matches the image best (Lucas and Kanade 1981, inverse compositional as in Baker and Matthews 2004,
+//! with gain and offset of the gray values).
+
+use crate::gray::Plane;
+use crate::surface::Surface;
+use nalgebra::{Matrix2, Matrix4, Vector2, Vector4};
+
+/// Smallest correlation between image and pattern.
+const MIN_CORRELATION: f64 = 0.75;
+/// Smallest standard deviation of the gray values.
+const MIN_DEVIATION: f64 = 6.0;
+
+/// The surroundings of a corner.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Neighborhood {
+    /// Position in the board frame, meters.
+    pub(crate) point_m: [f64; 2],
+    /// Predicted position.
+    pub(crate) pixel: [f64; 2],
+    /// Derivative of the pixel with respect to the point, pixels per meter.
+    pub(crate) pixel_by_point: Matrix2<f64>,
+    /// Second derivatives of the pixel with respect to x and x, x and y, y and y, pixels per square meter.
+    pub(crate) bend: [[f64; 2]; 3],
+    /// Size of the part of the board whose image is about as large as the compared window should be.
+    pub(crate) side_m: f64,
+    /// Largest distance from the predicted position. `None`: a part of the window.
+    pub(crate) reach_px: Option<f64>,
+}
+
+/// Half the side of the window, relative to the image of `side_m`, and its limits in pixels.
+pub(crate) const WINDOW_FRAC: f64 = 0.35;
+const HALF_WINDOW_PX: [f64; 2] = [3.0, 9.0];
+/// Largest distance from a prediction, relative to the image of `side_m`, and its limits in pixels.
+const REACH_FRAC: f64 = 0.12;
+const REACH_PX: [f64; 2] = [1.5, 8.0];
+/// Numbers of times the pattern is blurred by the kernel (1 2 1) / 4, from images in focus to images out of focus.
+const BLURS: [usize; 3] = [1, 4, 10];
+/// Above this correlation, no other blur is tried.
+const GOOD_CORRELATION: f64 = 0.94;
+
+/// Finds the corner. `None` if the image does not show the pattern there.
+pub(crate) fn find(plane: &Plane, surface: &Surface<'_>, neighborhood: &Neighborhood) -> Option<[f64; 2]> {
+    let Neighborhood { pixel, pixel_by_point, side_m, .. } = *neighborhood;
+    let side_px = pixel_by_point.column(0).norm().min(pixel_by_point.column(1).norm()) * side_m;
+    #[expect(clippy::cast_possible_truncation, reason = "a few pixels")]
+    let half_px = (WINDOW_FRAC * side_px).clamp(HALF_WINDOW_PX[0], HALF_WINDOW_PX[1]).round() as i32;
+    let reach_px = neighborhood.reach_px.unwrap_or((REACH_FRAC * side_px).clamp(REACH_PX[0], REACH_PX[1]));
+    if !side_px.is_finite() || !plane.contains(pixel, f64::from(half_px) + reach_px + 1.0) {
+        return None;
+    }
+    let mut best: Option<(f64, [f64; 2])> = None;
+    for n_blurs in BLURS {
+        let found = Template::new(surface, neighborhood, half_px, n_blurs)?.find(plane, pixel, reach_px);
+        // The correlation rises up to the blur of the image and falls beyond it.
+        let is_worse = |best: (f64, [f64; 2])| found.is_none_or(|found| found.0 <= best.0);
+        if best.is_some_and(is_worse) {
+            break;
+        }
+        best = found;
+        if best.is_some_and(|(correlation, _)| correlation >= GOOD_CORRELATION) {
+            break;
+        }
+    }
+    best.filter(|(correlation, _)| *correlation >= MIN_CORRELATION).map(|(_, pixel)| pixel)
+}
+
+/// The rendered pattern with its derivatives.
+struct Template {
+    half_px: i32,
+    /// White fraction per pixel, row by row, minus the mean.
+    values: Vec<f64>,
+    norm: f64,
+    /// Derivatives of each value with respect to shift, gain and offset.
+    steepest: Vec<Vector4<f64>>,
+    inverse: Matrix4<f64>,
+}
+
+impl Template {
+    fn new(surface: &Surface<'_>, neighborhood: &Neighborhood, half_px: i32, n_blurs: usize) -> Option<Self> {
+        let point_by_pixel = neighborhood.pixel_by_point.try_inverse()?;
+        // More pixels on each side for blur and derivatives.
+        let padding = i32::try_from(n_blurs).ok()? + 1;
+        let (padded, side) = (half_px + padding, 2 * (half_px + padding) + 1);
+        let value = |at: i32| {
+            const OFFSETS: [f64; 4] = [-0.375, -0.125, 0.125, 0.375];
+            let offset = [f64::from(at % side - padded), f64::from(at / side - padded)];
+            let samples = OFFSETS.iter().flat_map(|dy| OFFSETS.map(|dx| [offset[0] + dx, offset[1] + dy]));
+            let is_white = |[x, y]: [f64; 2]| {
+                let first = point_by_pixel * Vector2::new(x, y);
+                let [xx, xy, yy] = [first.x * first.x / 2.0, first.x * first.y, first.y * first.y / 2.0];
+                let bent = [0, 1].map(|axis| {
+                    let bend = neighborhood.bend.map(|derivative| derivative[axis]);
+                    xx * bend[0] + xy * bend[1] + yy * bend[2]
+                });
+                let away = point_by_pixel * Vector2::new(x - bent[0], y - bent[1]);
+                !surface.is_black([neighborhood.point_m[0] + away.x, neighborhood.point_m[1] + away.y])
+            };
+            samples.filter(|&sample| is_white(sample)).count() as f64 / 16.0
+        };
+        let sharp: Vec<f64> = (0..side * side).map(value).collect();
+        let at = |values: &[f64], x: i32, y: i32| values[(y * side + x).cast_unsigned() as usize];
+        // Lenses and sensors blur, too.
+        let mut blurred = sharp;
+        for pass in 1..=padding - 1 {
+            let before = blurred.clone();
+            for y in pass..side - pass {
+                for x in pass..side - pass {
+                    let row = |y: i32| at(&before, x - 1, y) + 2.0 * at(&before, x, y) + at(&before, x + 1, y);
+                    blurred[(y * side + x).cast_unsigned() as usize] = (row(y - 1) + 2.0 * row(y) + row(y + 1)) / 16.0;
+                }
+            }
+        }
+        let inner = || (padding..side - padding).flat_map(|y| (padding..side - padding).map(move |x| (x, y)));
+        let values: Vec<f64> = inner().map(|(x, y)| at(&blurred, x, y)).collect();
+        let mean = values.iter().sum::<f64>() / values.len() as f64;
+        let values: Vec<f64> = values.into_iter().map(|value| value - mean).collect();
+        let norm = values.iter().map(|value| value * value).sum::<f64>().sqrt();
+        let derivative = |(x, y): (i32, i32)| {
+            let dx = (at(&blurred, x + 1, y) - at(&blurred, x - 1, y)) / 2.0;
+            let dy = (at(&blurred, x, y + 1) - at(&blurred, x, y - 1)) / 2.0;
+            (dx, dy)
+        };
+        let steepest: Vec<Vector4<f64>> = inner()
+            .zip(&values)
+            .map(|(cell, &value)| {
+                let (dx, dy) = derivative(cell);
+                Vector4::new(dx, dy, value, 1.0)
+            })
+            .collect();
+        let hessian = steepest.iter().map(|row| row * row.transpose()).sum::<Matrix4<f64>>();
+        Some(Self { half_px, values, norm, steepest, inverse: hessian.try_inverse()? })
+    }
+
+    /// Finds the shift of the pattern, and the correlation there.
+    fn find(&self, plane: &Plane, pixel: [f64; 2], reach_px: f64) -> Option<(f64, [f64; 2])> {
+        // The best whole-pixel shift first: the alignment converges from about half an edge's width.
+        #[expect(clippy::cast_possible_truncation, reason = "a few pixels")]
+        let steps = reach_px.floor() as i32;
+        let shifts = (-steps..=steps).flat_map(|y| (-steps..=steps).map(move |x| [f64::from(x), f64::from(y)]));
+        let centers = shifts.map(|[x, y]| [pixel[0] + x, pixel[1] + y]);
+        let scored = centers.map(|center| (self.correlation(plane, center), center));
+        let (_, start) = scored.max_by(|a, b| a.0.total_cmp(&b.0))?;
+        let refined = self.align(plane, start)?;
+        let is_near = (refined[0] - pixel[0]).hypot(refined[1] - pixel[1]) <= reach_px + 0.5;
+        is_near.then(|| (self.correlation(plane, refined), refined))
+    }
+
+    fn samples(&self, plane: &Plane, center: [f64; 2]) -> impl Iterator<Item = f64> {
+        let range = -self.half_px..=self.half_px;
+        let offsets = range.clone().flat_map(move |y| range.clone().map(move |x| [f64::from(x), f64::from(y)]));
+        offsets.map(move |[x, y]| f64::from(plane.sample([center[0] + x, center[1] + y])))
+    }
+
+    /// Correlation coefficient of the image and the pattern, -1 to 1.
+    fn correlation(&self, plane: &Plane, center: [f64; 2]) -> f64 {
+        let (mut sum, mut squares, mut products) = (0.0, 0.0, 0.0);
+        for (sample, value) in self.samples(plane, center).zip(&self.values) {
+            sum += sample;
+            squares += sample * sample;
+            products += sample * value;
+        }
+        let n = self.values.len() as f64;
+        let deviation = (squares - sum * sum / n).max(0.0).sqrt();
+        if deviation < MIN_DEVIATION * n.sqrt() { 0.0 } else { products / (deviation * self.norm) }
+    }
+
+    /// Shifts the pattern to the position of least squares.
+    fn align(&self, plane: &Plane, start: [f64; 2]) -> Option<[f64; 2]> {
+        const MAX_STEPS: usize = 20;
+        const CONVERGED_PX: f64 = 1e-3;
+        let mut center = start;
+        for _ in 0..MAX_STEPS {
+            let right =
+                self.samples(plane, center).zip(&self.steepest).map(|(sample, row)| row * sample).sum::<Vector4<f64>>();
+            let solution = self.inverse * right;
+            // The image is gain * pattern(shifted) + offset; its derivative with respect to the shift is gain * gradient.
+            let gain = solution[2];
+            if gain <= 0.0 {
+                return None;
+            }
+            let step = [solution[0] / gain, solution[1] / gain];
+            let limited = step.map(|value| value.clamp(-0.7, 0.7));
+            center = [center[0] - limited[0], center[1] - limited[1]];
+            let is_near = (center[0] - start[0]).hypot(center[1] - start[1]) < 2.0;
+            if !is_near {
+                return None;
+            }
+            if step[0].hypot(step[1]) < CONVERGED_PX {
+                break;
+            }
+        }
+        Some(center)
+    }
+}
