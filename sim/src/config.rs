@@ -31,6 +31,9 @@ pub struct Config {
     pub joint_names: Vec<String>,
     /// Joint names in the order of the joint readings.
     pub reading_order: Vec<String>,
+    /// Offsets that must be added to the joint readings to get the true positions, in the order of the readings,
+    /// radians; empty if the readings are right.
+    pub joint_offsets: Vec<f64>,
     /// The cameras; names are unique.
     pub cameras: Vec<CameraConfig>,
     /// The range scanners; names are unique.
@@ -166,10 +169,21 @@ pub struct CameraConfig {
     pub parent: Parent,
     /// Camera pose in the parent frame.
     pub parent_from_camera: Transform,
+    /// Errors of the image stamps.
+    pub stamps: StampConfig,
     /// Imperfections of the color images.
     pub sensor: SensorConfig,
     /// Depth images, if the camera has them.
     pub depth: Option<DepthConfig>,
+}
+
+/// Errors of image stamps.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct StampConfig {
+    /// Time that must be added to a stamp to get mid-exposure, seconds.
+    pub to_mid_exposure_secs: f64,
+    /// Rate error of the clock: it gains this fraction of the time since the start.
+    pub drift_frac: f64,
 }
 
 /// Imperfections of color images. Exposure and white balance are locked.
@@ -211,6 +225,8 @@ impl Default for SensorConfig {
 /// Imperfections and limits of depth images, which have the stamp of the color image and a global shutter.
 #[derive(Clone, Debug, PartialEq)]
 pub struct DepthConfig {
+    /// Factor that must be applied to the readings to get the true depth.
+    pub factor: f64,
     /// Separate depth sensor. If `None`, depth is registered to the color image.
     pub sensor: Option<DepthSensor>,
     /// Standard deviation at 1 m, meters; grows with the square of the depth.
@@ -236,7 +252,15 @@ pub struct DepthSensor {
 
 impl Default for DepthConfig {
     fn default() -> Self {
-        Self { sensor: None, noise_sigma_m: 0.0015, hole_frac: 0.02, min_m: 0.1, max_m: 6.0, meters_per_count: 1e-4 }
+        Self {
+            factor: 1.0,
+            sensor: None,
+            noise_sigma_m: 0.0015,
+            hole_frac: 0.02,
+            min_m: 0.1,
+            max_m: 6.0,
+            meters_per_count: 1e-4,
+        }
     }
 }
 
@@ -255,6 +279,7 @@ impl CameraConfig {
             rate_hz: 15.0,
             parent: Parent::Flange,
             parent_from_camera: wrist_extrinsics(50.0),
+            stamps: StampConfig::default(),
             sensor: SensorConfig::default(),
             depth: Some(DepthConfig::default()),
         }
@@ -313,6 +338,7 @@ impl Default for Config {
             n_images: None,
             joint_names: (1..=7).map(|ix| format!("panda_joint{ix}")).collect(),
             reading_order: (1..=7).map(|ix| format!("panda_joint{ix}")).collect(),
+            joint_offsets: Vec::new(),
             cameras: vec![CameraConfig::wrist("wrist")],
             scanners: Vec::new(),
             base: BaseConfig::default(),
@@ -342,6 +368,10 @@ impl Config {
             return Err(Error::NJoints { got: self.joint_names.len(), expected });
         }
         self.joint_ixs()?;
+        if !self.joint_offsets.is_empty() && self.joint_offsets.len() != expected {
+            return Err(Error::NJoints { got: self.joint_offsets.len(), expected });
+        }
+        self.joint_offsets.iter().try_for_each(|offset| check("arm", "joint_offsets", *offset, -1.0, 1.0))?;
         check("sim", "light_inside_frac", self.light_inside_frac, 0.0, 4.0)?;
         self.base.check()?;
         if self.cameras.is_empty() {
@@ -404,6 +434,8 @@ impl CameraConfig {
         for number in pose {
             check(&self.name, "parent_from_camera", *number, -100.0, 100.0)?;
         }
+        check(&self.name, "stamp_to_mid_exposure", self.stamps.to_mid_exposure_secs, -1.0, 1.0)?;
+        check(&self.name, "clock_drift", self.stamps.drift_frac, -0.01, 0.01)?;
         let sensor = &self.sensor;
         check(&self.name, "noise_sigma", sensor.noise_sigma, 0.0, 100.0)?;
         check(&self.name, "shot_frac", sensor.shot_frac, 0.0, 1.0)?;
@@ -417,6 +449,7 @@ impl CameraConfig {
             if let Some(sensor) = &depth.sensor {
                 check_lens(&self.name, &sensor.intrinsics)?;
             }
+            check(&self.name, "depth factor", depth.factor, 0.5, 2.0)?;
             check(&self.name, "depth noise_sigma_m", depth.noise_sigma_m, 0.0, 1.0)?;
             check(&self.name, "hole_frac", depth.hole_frac, 0.0, 0.9)?;
             check(&self.name, "depth min_m", depth.min_m, 0.0, 10.0)?;

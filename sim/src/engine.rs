@@ -3,7 +3,7 @@
 use crate::arm::{JointReading, STEP_NANOS};
 use crate::base::Drift;
 use crate::cabinet_tour::light_frac;
-use crate::config::{CameraConfig, Config, Parent, Scene, SensorConfig};
+use crate::config::{CameraConfig, Config, Parent, Scene, SensorConfig, StampConfig};
 use crate::lidar::{self, RayCaster};
 use crate::noise;
 use crate::optics::{Optics, RowMotion};
@@ -129,6 +129,12 @@ impl Camera {
         let elapsed = self.n_exposed as f64 / self.config.rate_hz;
         let first = FIRST_NANOS + self.ix as i64 * STAGGER_NANOS;
         first + nanos_from_secs(elapsed)
+    }
+
+    /// The stamp that the camera reports for a mid-exposure at `nanos`.
+    fn reported_nanos(&self, nanos: i64) -> i64 {
+        let StampConfig { to_mid_exposure_secs, drift_frac } = self.config.stamps;
+        nanos + nanos_from_secs(drift_frac * nanos as f64 * 1e-9 - to_mid_exposure_secs)
     }
 
     /// Half of the time span over which the image's rows are exposed.
@@ -392,7 +398,7 @@ impl Engine {
         let camera = &self.cameras[exposure.camera_ix];
         let picture = exposure.picture.wait()?;
         let (seed, image_ix) = (self.config.seed, exposure.image_ix);
-        let stamp = Stamp(self.start.0 + exposure.stamp_nanos);
+        let stamp = Stamp(self.start.0 + camera.reported_nanos(exposure.stamp_nanos));
         let depth_lens = camera.config.depth.as_ref().and_then(|depth| Some(&depth.sensor.as_ref()?.intrinsics));
         let color_px = camera.config.intrinsics.size_px;
         let depth_px = depth_lens.map_or(color_px, |lens| lens.size_px);
@@ -449,10 +455,12 @@ impl Engine {
     }
 
     fn joint_state(&self, reading: &JointReading) -> JointState {
-        let ordered = |joints: &Joints| self.joint_ixs.iter().map(|ix| joints[*ix]).collect();
+        let ordered = |joints: &Joints| -> Vec<f64> { self.joint_ixs.iter().map(|ix| joints[*ix]).collect() };
+        let mut position = ordered(&reading.position_rad);
+        position.iter_mut().zip(&self.config.joint_offsets).for_each(|(position, offset)| *position -= offset);
         JointState {
             stamp: Stamp(self.start.0 + reading.nanos),
-            position: ordered(&reading.position_rad),
+            position,
             velocity: ordered(&reading.velocity_rad_s),
             effort: ordered(&reading.torque_nm),
         }

@@ -57,6 +57,7 @@ pub mod layout {
 
 pub use config::{
     BaseConfig, CameraConfig, Config, DepthConfig, DepthSensor, Parent, ScannerConfig, Scene, SensorConfig,
+    StampConfig,
 };
 pub use error::Error;
 pub use live::{LiveRig, LiveTruth};

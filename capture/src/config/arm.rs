@@ -27,6 +27,8 @@ keys! {
         /// Offsets added to the joint positions, in the order of `joints`, rad or m, each from -1 to 1; empty if there
         /// are none.
         pub joint_offsets: Vec<f64> = Vec::new();
+        /// Settings of a simulated arm.
+        pub sim: ArmSim;
         /// Link of the URDF that is the base of the robot.
         pub base_link: String = String::new();
         /// Link of the URDF to which cameras with the parent [`Parent::Flange`](super::Parent::Flange) are attached.
@@ -41,6 +43,14 @@ keys! {
         pub motors: Vec<MotorConfig> => Vec::new();
         /// How the arm may be moved; `None` if it is only read.
         pub motion: Option<ArmMotion>;
+    }
+
+    /// Settings of a simulated arm.
+    #[derive(Clone, Debug, Default, PartialEq)]
+    pub struct ArmSim {
+        /// Offsets that must be added to the simulated readings to get the true joint positions, in the order of
+        /// `joints`, rad, each from -1 to 1; empty if the readings are right.
+        pub true_joint_offsets: Vec<f64> = Vec::new();
     }
 }
 
@@ -107,12 +117,17 @@ pub(super) fn resolve_joints(file: &str, arm: &mut Arm) -> Result<(), ConfigErro
     }
     chain.order_in(&arm.joints).map_err(|e| robot("arm.joints", e))?;
     resolve_motors(file, arm)?;
-    let (n, n_joints) = (arm.joint_offsets.len(), arm.joints.len());
-    if n == 0 || (n == n_joints && arm.joint_offsets.iter().all(|offset| offset.abs() <= MAX_JOINT_OFFSET)) {
+    check_offsets(file, "arm.joint_offsets", &arm.joint_offsets, arm.joints.len())?;
+    check_offsets(file, "arm.sim.true_joint_offsets", &arm.sim.true_joint_offsets, arm.joints.len())
+}
+
+fn check_offsets(file: &str, key: &'static str, offsets: &[f64], n_joints: usize) -> Result<(), ConfigError> {
+    let n = offsets.len();
+    if n == 0 || (n == n_joints && offsets.iter().all(|offset| offset.abs() <= MAX_JOINT_OFFSET)) {
         return Ok(());
     }
     let reason = format!("{n} numbers; must be {n_joints} from -{MAX_JOINT_OFFSET} to {MAX_JOINT_OFFSET}, or none");
-    Err(ConfigError::Robot { file: file.to_owned(), key: "arm.joint_offsets", reason })
+    Err(ConfigError::Robot { file: file.to_owned(), key, reason })
 }
 
 /// Sorts the motors by joint. An arm on CAN buses needs exactly one motor per joint.

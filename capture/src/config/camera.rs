@@ -147,6 +147,27 @@ keys! {
         pub depth_hole_frac: f64 = 0.02, in 0.0..=0.9;
         /// Meters per count of the depth images.
         pub meters_per_count: f64 = 1e-4, in 1e-6..=0.1;
+        /// True calibration, where it differs from the rest of the rig file.
+        pub truth: CameraTruth;
+    }
+
+    /// True calibration of a simulated camera. Values that are absent are those of the rig file.
+    #[derive(Clone, Debug, Default, PartialEq)]
+    pub struct CameraTruth {
+        /// True [`Camera::parent_from_camera`].
+        pub parent_from_camera: Option<Transform>;
+        /// True lens of the color images; their size is that of the rig file.
+        pub intrinsics: Option<Intrinsics>;
+        /// True time from the stamps to mid-exposure, milliseconds.
+        pub stamp_to_mid_exposure_millis: f64 = 0.0, in -1000.0..=1000.0;
+        /// Rate error of the clock that stamps the images, parts per million.
+        pub clock_drift_ppm: f64 = 0.0, in -10_000.0..=10_000.0;
+        /// True [`Camera::readout_micros`].
+        pub readout_micros: Option<f64>, in 0.0..=1e6;
+        /// True [`Depth::camera_from_depth`].
+        pub camera_from_depth: Option<Transform>;
+        /// True [`Depth::factor`].
+        pub depth_factor: f64 = 1.0, in 0.5..=2.0;
     }
 }
 
@@ -232,6 +253,9 @@ pub(super) fn read(name: &str, mut keys: Section<'_>) -> Option<Camera> {
     let depth = keys.optional_section("depth").map(|keys| depth(keys, &intrinsics, &mut unknown));
     keys.end();
     let mut camera = Camera { name: name.into(), intrinsics, depth: depth.flatten(), ..camera? };
+    if let Some(lens) = &mut camera.sim.truth.intrinsics {
+        (lens.size_px, lens.rectified) = (camera.intrinsics.size_px, camera.intrinsics.rectified);
+    }
     if reports_intrinsics {
         camera.realsense.unknown = unknown;
     }

@@ -31,6 +31,11 @@ intrinsics = { focal_px = [600, 600], principal_px = [320.0, 240.0], lens = "bro
 size_px = [320, 240]
 intrinsics = { focal_px = [300, 300], principal_px = [160.0, 120.0], lens = "brown_conrady", distortion = [0, 0, 0, 0, 0] }
 [camera.wrist.sim]
+[camera.wrist.sim.truth]
+parent_from_camera = { xyz_m = [0.0, 0.0, 0.1], quat_xyzw = [0.0, 0.0, 0.0, 1.0] }
+intrinsics = { focal_px = [600, 600], principal_px = [320.0, 240.0], lens = "brown_conrady", distortion = [0, 0, 0, 0, 0] }
+camera_from_depth = { xyz_m = [0.0, 0.0, 0.1], quat_xyzw = [0.0, 0.0, 0.0, 1.0] }
+[arm.sim]
 [base]
 [join]
 [train]
@@ -74,7 +79,7 @@ fn with(key: &'static str, value: &str) -> Result<Rig, ConfigError> {
 }
 
 /// Key, a valid value that differs from the current one, and an invalid value.
-const KEYS: [(&str, &str, &str); 163] = [
+const KEYS: [(&str, &str, &str); 176] = [
     ("arm.rate_hz", "500", "0"),
     ("arm.bus.can0.bitrate_hz", "500_000", "1"),
     ("arm.bus.can0.data_bitrate_hz", "5_000_000", "9_000_000"),
@@ -109,6 +114,7 @@ const KEYS: [(&str, &str, &str); 163] = [
     ("arm.urdf", "'other.urdf'", "7"),
     ("arm.joints", "['j2', 'j1']", "['j1', 'j9']"),
     ("arm.joint_offsets", "[0.01, -0.02]", "[0.01]"),
+    ("arm.sim.true_joint_offsets", "[0.01, -0.02]", "[0.01]"),
     ("arm.base_link", "'b'", "'nowhere'"),
     ("arm.flange_link", "'tool'", "'nowhere'"),
     ("arm.max_speed_rad_s", "0.25", "-1"),
@@ -195,6 +201,18 @@ const KEYS: [(&str, &str, &str); 163] = [
     ("camera.wrist.sim.depth_noise_sigma_m", "0.01", "2"),
     ("camera.wrist.sim.depth_hole_frac", "0.1", "1"),
     ("camera.wrist.sim.meters_per_count", "0.001", "0"),
+    ("camera.wrist.sim.truth.parent_from_camera.xyz_m", "[0, 0, 0.2]", "[0, 0, inf]"),
+    ("camera.wrist.sim.truth.parent_from_camera.quat_xyzw", "[0, 1, 0, 0]", "[0, 0, 0, 0]"),
+    ("camera.wrist.sim.truth.intrinsics.focal_px", "[500, 501]", "[0, 500]"),
+    ("camera.wrist.sim.truth.intrinsics.principal_px", "[321, 241]", "[nan, 240]"),
+    ("camera.wrist.sim.truth.intrinsics.lens", "'pinhole'", "'thin'"),
+    ("camera.wrist.sim.truth.intrinsics.distortion", "[0, 0, 0, 0, 0.1]", "[0.1]"),
+    ("camera.wrist.sim.truth.stamp_to_mid_exposure_millis", "-12", "2000"),
+    ("camera.wrist.sim.truth.clock_drift_ppm", "75", "'fast'"),
+    ("camera.wrist.sim.truth.readout_micros", "12_000", "-1"),
+    ("camera.wrist.sim.truth.camera_from_depth.xyz_m", "[0.01, 0, 0]", "[]"),
+    ("camera.wrist.sim.truth.camera_from_depth.quat_xyzw", "[0, 1, 0, 0]", "[2, 0, 0, 0]"),
+    ("camera.wrist.sim.truth.depth_factor", "1.01", "0"),
     ("join.start_keyframes", "8", "0"),
     ("join.max_keyframes", "50", "7"),
     ("join.max_bytes", "50_000_000", "-5"),

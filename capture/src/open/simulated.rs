@@ -1,9 +1,9 @@
 //! Opens the simulated twin of a rig: the same cameras and joints in MuJoCo.
 
-use crate::config::{BaseDriver, Camera, CameraDriver, Parent, Rig, Scanner, ScannerDriver};
+use crate::config::{BaseDriver, Camera, CameraDriver, Depth, Parent, Rig, Scanner, ScannerDriver};
 use drivers::{Devices, Error, Live, Sample, Source};
 use keyframe::bail;
-use kinematics::{Stamp, Transform};
+use kinematics::{Intrinsics, Stamp, Transform};
 use std::sync::Arc;
 
 /// Opens the simulated rig, in lockstep or in real time according to the rig file. In real time, `real` devices run in
@@ -94,6 +94,7 @@ fn config_of(rig: &Rig) -> crate::Result<sim::Config> {
         n_images: rig.sim.n_images,
         joint_names: super::chain_of(rig)?.joint_names().to_vec(),
         reading_order: rig.arm.joints.clone(),
+        joint_offsets: rig.arm.sim.true_joint_offsets.clone(),
         scanners: rig.scanners.iter().filter(|scanner| scanner.driver == ScannerDriver::Sim).map(scanner_of).collect(),
         base: sim::BaseConfig {
             rate_hz: rig.base.rate_hz,
@@ -122,33 +123,35 @@ fn scanner_of(scanner: &Scanner) -> sim::ScannerConfig {
 
 fn camera_of(camera: &Camera) -> sim::CameraConfig {
     let default = sim::SensorConfig::default();
+    let truth = &camera.sim.truth;
+    let intrinsics = truth.intrinsics.as_ref().unwrap_or(&camera.intrinsics);
     sim::CameraConfig {
         name: camera.name.to_string(),
-        intrinsics: camera.intrinsics.clone(),
+        intrinsics: intrinsics.clone(),
         rate_hz: camera.rate_hz,
         parent: match camera.parent {
             Parent::Flange => sim::Parent::Flange,
             Parent::Base => sim::Parent::Base,
             Parent::World => sim::Parent::World,
         },
-        parent_from_camera: camera.parent_from_camera,
+        parent_from_camera: truth.parent_from_camera.unwrap_or(camera.parent_from_camera),
+        stamps: sim::StampConfig {
+            to_mid_exposure_secs: 1e-3 * truth.stamp_to_mid_exposure_millis,
+            drift_frac: 1e-6 * truth.clock_drift_ppm,
+        },
         sensor: sim::SensorConfig {
             noise_sigma: camera.sim.noise_sigma,
             shot_frac: camera.sim.shot_frac,
             exposure_micros: camera.exposure_micros.unwrap_or(default.exposure_micros),
             blur_samples: camera.sim.blur_samples,
-            readout_micros: camera.readout_micros.unwrap_or(0.0),
+            readout_micros: truth.readout_micros.or(camera.readout_micros).unwrap_or(0.0),
             latency_millis: camera.sim.latency_millis,
             dropped_frac: camera.sim.dropped_frac,
             supersample: camera.sim.supersample,
         },
         depth: camera.depth.as_ref().map(|depth| sim::DepthConfig {
-            sensor: (depth.intrinsics != camera.intrinsics || depth.camera_from_depth != Transform::identity()).then(
-                || sim::DepthSensor {
-                    intrinsics: depth.intrinsics.clone(),
-                    camera_from_depth: depth.camera_from_depth,
-                },
-            ),
+            sensor: depth_sensor(camera, depth, intrinsics),
+            factor: truth.depth_factor,
             noise_sigma_m: camera.sim.depth_noise_sigma_m,
             hole_frac: camera.sim.depth_hole_frac,
             min_m: depth.min_m,
@@ -156,4 +159,13 @@ fn camera_of(camera: &Camera) -> sim::CameraConfig {
             meters_per_count: camera.sim.meters_per_count,
         }),
     }
+}
+
+/// The depth sensor; `None` if depth is registered to the color image.
+fn depth_sensor(camera: &Camera, depth: &Depth, color: &Intrinsics) -> Option<sim::DepthSensor> {
+    let camera_from_depth = camera.sim.truth.camera_from_depth.unwrap_or(depth.camera_from_depth);
+    // A true lens of the color images is also that of depth images which are registered to them.
+    let intrinsics = if depth.intrinsics == camera.intrinsics { color } else { &depth.intrinsics };
+    let is_registered = intrinsics == color && camera_from_depth == Transform::identity();
+    (!is_registered).then(|| sim::DepthSensor { intrinsics: intrinsics.clone(), camera_from_depth })
 }

@@ -1,0 +1,334 @@
+//! `fieldrig calibrate hand-eye`: the pose of a camera on a robot, from images of a target or poses of a board.
+
+use super::lens::LensFile;
+use super::{images, matrix_of, target_argument, transform_of};
+use crate::exit::{BadArgument, Exit, InsufficientData};
+use crate::print;
+use anyhow::Context;
+use calibration::hand_eye::{
+    BoardObservation, HandEyeCalibration, HandEyeInput, HandEyeOptions, HandEyeSample, Refusal, SampleStatus, Setup,
+    calibrate_hand_eye,
+};
+use kinematics::Chain;
+use kinematics::urdf::Robot;
+use serde::{Deserialize, Serialize};
+use std::path::{Path, PathBuf};
+use targets::TargetSpec;
+
+/// Flags of `calibrate hand-eye`.
+#[derive(Debug, clap::Args)]
+pub(crate) struct Args {
+    /// Samples as JSON
+    ///
+    /// {"intrinsics": {"focal_px": [fx, fy], "principal_px": [cx, cy], "distortion": [...]}, "target":
+    /// "charuco:5x7:34mm:28mm:6X6_250", "setup": "eye-in-hand", "samples": [{"base_from_flange": [[4x4]], "image":
+    /// "0.png"}, ...]}. Instead of an image, a sample may contain the pose of the board, "camera_from_board"; then
+    /// intrinsics and target are not needed. "setup" may be "eye-to-hand": the camera is fixed and the board moves with
+    /// the flange. Lengths in meters, matrices row by row, image files relative to this file.
+    #[arg(value_name = "SAMPLES.json")]
+    samples: PathBuf,
+    /// Also estimate the intrinsics, starting from those in the file; needs images
+    #[arg(long)]
+    with_intrinsics: bool,
+    /// Also estimate offsets of the joints between the first and the last; needs images, "joints" in the samples, and
+    /// --urdf and --tip
+    #[arg(long, requires_all = ["urdf", "tip"])]
+    with_joints: bool,
+    /// Robot description of the arm
+    #[arg(long, value_name = "FILE.urdf", requires = "tip")]
+    urdf: Option<PathBuf>,
+    /// Link of the robot description that is the flange
+    #[arg(long, value_name = "LINK", requires = "urdf")]
+    tip: Option<String>,
+    /// Print one JSON object
+    #[arg(long)]
+    json: bool,
+}
+
+/// Contents of the samples file.
+#[derive(Debug, Deserialize)]
+struct SamplesFile {
+    #[serde(default)]
+    intrinsics: Option<LensFile>,
+    #[serde(default)]
+    target: Option<String>,
+    #[serde(default)]
+    setup: Option<String>,
+    samples: Vec<SampleEntry>,
+}
+
+#[derive(Debug, Deserialize)]
+struct SampleEntry {
+    base_from_flange: serde_json::Value,
+    #[serde(default)]
+    camera_from_board: Option<serde_json::Value>,
+    #[serde(default)]
+    image: Option<PathBuf>,
+    #[serde(default)]
+    joints: Option<Vec<f64>>,
+}
+
+type Matrix = [[f64; 4]; 4];
+
+/// The printed result. Matrices are row by row; standard deviations along and about the axes of the camera.
+#[derive(Debug, Default, Serialize)]
+struct Printed {
+    #[serde(skip_serializing_if = "Option::is_none")]
+    flange_from_camera: Option<Matrix>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    base_from_camera: Option<Matrix>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    base_from_board: Option<Matrix>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    flange_from_board: Option<Matrix>,
+    scatter_mm: Option<f64>,
+    scatter_deg: Option<f64>,
+    held_out_scatter_mm: Option<f64>,
+    held_out_scatter_deg: Option<f64>,
+    rms_px: Option<f64>,
+    held_out_rms_px: Option<f64>,
+    sigma_mm: Option<[f64; 3]>,
+    sigma_deg: Option<[f64; 3]>,
+    /// The estimated intrinsics, if they were requested.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    intrinsics: Option<LensFile>,
+    joint_offsets: Vec<PrintedJoint>,
+    samples: Vec<PrintedSample>,
+    warnings: Vec<String>,
+    refused: Option<String>,
+}
+
+#[derive(Debug, Serialize)]
+struct PrintedJoint {
+    joint: String,
+    /// Offset to add to the readings, radians or meters; null if it cannot be observed.
+    offset: Option<f64>,
+    sigma: Option<f64>,
+}
+
+#[derive(Debug, Serialize)]
+struct PrintedSample {
+    name: String,
+    status: &'static str,
+    position_mm: Option<f64>,
+    rotation_deg: Option<f64>,
+    rms_px: Option<f64>,
+}
+
+/// Calibrates and prints the result. Exit code 4 if the samples do not determine it.
+pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
+    let file = SamplesFile::read(&args.samples)?;
+    let setup = file.setup()?;
+    let target = file.target.as_deref().map(target_argument).transpose().map_err(BadArgument)?;
+    let samples = file.samples(&args.samples, target.as_ref(), args.json)?;
+    let symmetries = target.as_ref().map(TargetSpec::symmetry).unwrap_or_default();
+    let chain = args.chain()?;
+    let input = HandEyeInput {
+        setup,
+        samples: samples.used,
+        intrinsics: file.intrinsics.as_ref().map(LensFile::intrinsics).transpose()?,
+        board_symmetries: &symmetries,
+        chain: chain.as_ref(),
+        options: HandEyeOptions {
+            estimate_intrinsics: args.with_intrinsics,
+            estimate_joint_offsets: args.with_joints,
+            ..HandEyeOptions::default()
+        },
+    };
+    let printed = match calibrate_hand_eye(&input) {
+        Ok(calibration) => printed(&calibration),
+        Err(calibration::Error::Refused(refusal)) if args.json => refused(&refusal),
+        Err(error) => return Err(error.into()),
+    };
+    let printed = Printed { samples: printed.samples.into_iter().chain(samples.unused).collect(), ..printed };
+    let exit = if printed.refused.is_some() { Exit::InsufficientData } else { Exit::Done };
+    if args.json { print::json(&printed)? } else { describe(&printed)? }
+    Ok(exit)
+}
+
+impl Args {
+    fn chain(&self) -> anyhow::Result<Option<Chain>> {
+        let (Some(urdf), Some(tip)) = (&self.urdf, &self.tip) else { return Ok(None) };
+        let of_file = || urdf.display().to_string();
+        let text = std::fs::read_to_string(urdf).with_context(|| format!("cannot read {}", of_file()))?;
+        let robot = Robot::parse(&text).with_context(of_file)?;
+        let root = robot.root().with_context(of_file)?.to_owned();
+        Ok(Some(Chain::new(&robot, &root, tip).with_context(of_file)?))
+    }
+}
+
+/// Samples of the file.
+struct Samples {
+    used: Vec<HandEyeSample>,
+    /// Samples whose image does not show the target.
+    unused: Vec<PrintedSample>,
+}
+
+impl SamplesFile {
+    fn read(path: &Path) -> anyhow::Result<Self> {
+        let text = std::fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))?;
+        serde_json::from_str(&text).map_err(|error| BadArgument(format!("{}: {error}", path.display())).into())
+    }
+
+    fn setup(&self) -> Result<Setup, BadArgument> {
+        match self.setup.as_deref() {
+            None | Some("eye-in-hand") => Ok(Setup::EyeInHand),
+            Some("eye-to-hand") => Ok(Setup::EyeToHand),
+            Some(other) => Err(BadArgument(format!("setup {other:?}, expected \"eye-in-hand\" or \"eye-to-hand\""))),
+        }
+    }
+
+    fn samples(&self, path: &Path, target: Option<&TargetSpec>, is_hidden: bool) -> anyhow::Result<Samples> {
+        let with_image = self.samples.iter().filter_map(|sample| sample.image.as_ref());
+        let folder = path.parent().unwrap_or(Path::new(""));
+        let files: Vec<PathBuf> = with_image.map(|image| folder.join(image)).collect();
+        let mut detected = match (files.is_empty(), target) {
+            (true, _) => Vec::new(),
+            (false, Some(target)) => images::detect(&files, target, is_hidden)?,
+            (false, None) => return Err(BadArgument(format!("{}: images need a \"target\"", path.display())).into()),
+        }
+        .into_iter();
+        if !files.is_empty() && self.intrinsics.is_none() {
+            return Err(BadArgument(format!("{}: images need \"intrinsics\"", path.display())).into());
+        }
+        let mut samples = Samples { used: Vec::new(), unused: Vec::new() };
+        for (ix, entry) in self.samples.iter().enumerate() {
+            let number = format!("sample {ix}");
+            let transform = |key: &str, value: &serde_json::Value| {
+                transform_of(value).map_err(|reason| BadArgument(format!("{}: {number}: {key}: {reason}", path.display())))
+            };
+            let base_from_flange = transform("base_from_flange", &entry.base_from_flange)?;
+            let (name, board) = match (&entry.camera_from_board, &entry.image) {
+                (Some(pose), None) => (number, BoardObservation::Pose(transform("camera_from_board", pose)?)),
+                (None, Some(_)) => {
+                    let image = detected.next().expect("one result per image");
+                    match image.board {
+                        Ok(view) => (image.name, BoardObservation::View(view)),
+                        Err(reason) => {
+                            log::warn!("{}: not used: {reason}", image.name);
+                            samples.unused.push(PrintedSample {
+                                name: image.name,
+                                status: "no-board",
+                                position_mm: None,
+                                rotation_deg: None,
+                                rms_px: None,
+                            });
+                            continue;
+                        }
+                    }
+                }
+                _ => {
+                    let message = "must contain either \"camera_from_board\" or \"image\"";
+                    return Err(BadArgument(format!("{}: {number} {message}", path.display())).into());
+                }
+            };
+            samples.used.push(HandEyeSample { name, base_from_flange, board, joints: entry.joints.clone() });
+        }
+        if samples.used.is_empty() && !samples.unused.is_empty() {
+            return Err(InsufficientData(format!("{}: no image shows the target", path.display())).into());
+        }
+        Ok(samples)
+    }
+}
+
+fn printed(calibration: &HandEyeCalibration) -> Printed {
+    let camera = Some(matrix_of(&calibration.parent_from_camera));
+    let board = Some(matrix_of(&calibration.parent_from_board));
+    let of_setup = |setup: Setup, matrix: Option<Matrix>| matrix.filter(|_| calibration.setup == setup);
+    let held_out = calibration.held_out_scatter;
+    Printed {
+        flange_from_camera: of_setup(Setup::EyeInHand, camera),
+        base_from_camera: of_setup(Setup::EyeToHand, camera),
+        base_from_board: of_setup(Setup::EyeInHand, board),
+        flange_from_board: of_setup(Setup::EyeToHand, board),
+        scatter_mm: Some(calibration.scatter.mm),
+        scatter_deg: Some(calibration.scatter.deg),
+        held_out_scatter_mm: held_out.map(|scatter| scatter.mm),
+        held_out_scatter_deg: held_out.map(|scatter| scatter.deg),
+        rms_px: calibration.rms_px,
+        held_out_rms_px: calibration.held_out_rms_px,
+        sigma_mm: Some(calibration.sigma_mm),
+        sigma_deg: Some(calibration.sigma_deg),
+        intrinsics: calibration.intrinsics.as_ref().map(|(intrinsics, _)| LensFile::of(intrinsics)),
+        joint_offsets: calibration
+            .joint_offsets
+            .iter()
+            .map(|offset| PrintedJoint {
+                joint: offset.joint.clone(),
+                offset: offset.estimate.map(|[value, _]| value),
+                sigma: offset.estimate.map(|[_, sigma]| sigma),
+            })
+            .collect(),
+        samples: calibration
+            .samples
+            .iter()
+            .map(|sample| PrintedSample {
+                name: sample.name.clone(),
+                status: match sample.status {
+                    SampleStatus::Used => "used",
+                    SampleStatus::Outlier => "outlier",
+                    SampleStatus::NoBoard => "no-board",
+                },
+                position_mm: sample.position_mm,
+                rotation_deg: sample.rotation_deg,
+                rms_px: sample.rms_px,
+            })
+            .collect(),
+        warnings: calibration.warnings.clone(),
+        refused: None,
+    }
+}
+
+fn refused(refusal: &Refusal) -> Printed {
+    Printed { refused: Some(refusal.to_string()), ..Printed::default() }
+}
+
+fn describe(printed: &Printed) -> anyhow::Result<()> {
+    let matrices = [
+        ("flange_from_camera", printed.flange_from_camera),
+        ("base_from_camera", printed.base_from_camera),
+        ("base_from_board", printed.base_from_board),
+        ("flange_from_board", printed.flange_from_board),
+    ];
+    for (name, matrix) in matrices {
+        let Some(matrix) = matrix else { continue };
+        print::line(format!("{name}, row by row (meters):"))?;
+        for row in matrix {
+            let row: Vec<String> = row.iter().map(|value| format!("{value:10.6}")).collect();
+            print::line(format!("  {}", row.join(" ")))?;
+        }
+    }
+    let three = |values: Option<[f64; 3]>, unit: &str| {
+        let values = values.unwrap_or_default().map(|value| format!("{value:.3}"));
+        format!("{} {unit}", values.join(", "))
+    };
+    print::line(format!(
+        "standard deviations of the camera along and about its x, y and z axes: {}; {}",
+        three(printed.sigma_mm, "mm"),
+        three(printed.sigma_deg, "degrees")
+    ))?;
+    if let (Some(mm), Some(deg)) = (printed.scatter_mm, printed.scatter_deg) {
+        print::line(format!("scatter of the board over the samples: {mm:.2} mm, {deg:.3} degrees"))?;
+    }
+    if let (Some(mm), Some(deg)) = (printed.held_out_scatter_mm, printed.held_out_scatter_deg) {
+        print::line(format!("the same for samples that were left out: {mm:.2} mm, {deg:.3} degrees"))?;
+    }
+    if let Some(rms_px) = printed.rms_px {
+        print::line(format!("reprojection error: {rms_px:.3} px (RMS)"))?;
+    }
+    for joint in &printed.joint_offsets {
+        print::line(match (joint.offset, joint.sigma) {
+            (Some(offset), Some(sigma)) => {
+                format!("offset of {}: {:.4} +- {:.4} degrees", joint.joint, offset.to_degrees(), sigma.to_degrees())
+            }
+            _ => format!("offset of {}: cannot be observed", joint.joint),
+        })?;
+    }
+    for sample in printed.samples.iter().filter(|sample| sample.status != "used") {
+        print::line(format!("not used: {}: {}", sample.name, sample.status))?;
+    }
+    for warning in &printed.warnings {
+        log::warn!("{warning}");
+    }
+    Ok(())
+}

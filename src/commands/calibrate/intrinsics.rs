@@ -1,0 +1,206 @@
+//! `fieldrig calibrate intrinsics`: the lens of a camera from images of a target.
+
+use super::images::{self, DetectedImage};
+use super::lens::LensFile;
+use super::target_argument;
+use crate::exit::{Exit, InsufficientData};
+use crate::print;
+use calibration::intrinsics::{
+    ImageGrid, IntrinsicsCalibration, IntrinsicsInput, LensModel, LensTrial, calibrate_intrinsics,
+};
+use calibration::BoardView;
+use serde::Serialize;
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use targets::TargetSpec;
+
+/// Flags of `calibrate intrinsics`.
+#[derive(Debug, clap::Args)]
+pub(crate) struct Args {
+    /// Folder of images (.jpg, .png) of the target, all of one camera and one size
+    #[arg(value_name = "IMAGES")]
+    folder: PathBuf,
+    /// The target, such as chessboard:9x6:25mm, charuco:5x7:34mm:28mm:6X6_250 or aprilgrid:6x6:88mm:0.3
+    #[arg(long, value_name = "SPEC", value_parser = target_argument)]
+    target: TargetSpec,
+    /// Lens model
+    #[arg(long, value_name = "MODEL", value_enum, default_value_t = ModelArg::Auto)]
+    model: ModelArg,
+    /// Print one JSON object
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+enum ModelArg {
+    /// The simplest model that explains the images
+    Auto,
+    /// No distortion
+    Pinhole,
+    /// k1, k2, p1, p2, k3
+    BrownConrady,
+    /// k1, k2, p1, p2, k3, k4, k5, k6
+    RationalBrownConrady,
+    /// k1 to k4 of OpenCV's fisheye model
+    KannalaBrandt,
+}
+
+/// The printed result.
+#[derive(Debug, Serialize)]
+struct Printed<'a> {
+    #[serde(flatten)]
+    lens: LensFile,
+    /// Names of the estimated coefficients; the others are zero.
+    coefficients: Vec<&'static str>,
+    rms_px: f64,
+    /// Standard deviation of a detected corner along one axis.
+    noise_px: f64,
+    /// Standard deviations of the parameters, by name.
+    sigma: BTreeMap<&'static str, f64>,
+    rejected: Vec<PrintedRejection>,
+    images: Vec<PrintedImage<'a>>,
+    /// Number of corners in each part of the image.
+    coverage: PrintedGrid<usize>,
+    /// Standard deviation of the projection of a distant point in each part of the image; null beyond the lens model.
+    projection_sigma_px: PrintedGrid<Option<f64>>,
+    trials: Vec<PrintedTrial<'a>>,
+    next_view: Option<&'a str>,
+}
+
+#[derive(Debug, Serialize)]
+struct PrintedRejection {
+    image: String,
+    reason: String,
+}
+
+#[derive(Debug, Serialize)]
+struct PrintedImage<'a> {
+    image: &'a str,
+    n_corners: usize,
+    rms_px: f64,
+}
+
+/// Values of the parts of the image, row by row.
+#[derive(Debug, Serialize)]
+struct PrintedGrid<T> {
+    columns: usize,
+    rows: usize,
+    values: Vec<T>,
+}
+
+/// Comparison of two lens models on held-out corners.
+#[derive(Debug, Serialize)]
+struct PrintedTrial<'a> {
+    baseline: &'a str,
+    variant: &'a str,
+    gain_db: f64,
+    standard_error_db: f64,
+    kept: bool,
+}
+
+/// Detects the target, calibrates, and prints the result.
+pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
+    let detected = images::detect(&images::files(&args.folder)?, &args.target, args.json)?;
+    let (mut views, mut sizes_px, mut rejected) = (Vec::<BoardView>::new(), Vec::new(), Vec::new());
+    for DetectedImage { name, size_px, board } in detected {
+        match board {
+            Ok(view) => {
+                views.push(view);
+                sizes_px.push(size_px);
+            }
+            Err(reason) => rejected.push(PrintedRejection { image: name, reason }),
+        }
+    }
+    if views.is_empty() {
+        // All images usually fail for the same reason.
+        let reason = rejected.first().map_or(String::new(), |first| format!("; {}: {}", first.image, first.reason));
+        let text = format!("{}: {} was detected in none of {} images{reason}", args.folder.display(), args.target, rejected.len());
+        return Err(InsufficientData(text).into());
+    }
+    let input = IntrinsicsInput { views: &views, sizes_px: &sizes_px, model: args.model.into() };
+    let calibration = calibrate_intrinsics(&input)?;
+    rejected.extend(calibration.rejected.iter().map(|rejected| PrintedRejection {
+        image: rejected.image.clone(),
+        reason: rejected.reason.to_string(),
+    }));
+    let printed = printed(&calibration, rejected);
+    if args.json { print::json(&printed)? } else { describe(&printed)? }
+    Ok(Exit::Done)
+}
+
+impl From<ModelArg> for LensModel {
+    fn from(model: ModelArg) -> Self {
+        match model {
+            ModelArg::Auto => Self::Auto,
+            ModelArg::Pinhole => Self::Pinhole,
+            ModelArg::BrownConrady => Self::BrownConrady5,
+            ModelArg::RationalBrownConrady => Self::BrownConrady8,
+            ModelArg::KannalaBrandt => Self::KannalaBrandt,
+        }
+    }
+}
+
+fn printed(calibration: &IntrinsicsCalibration, rejected: Vec<PrintedRejection>) -> Printed<'_> {
+    const N_PINHOLE_PARAMS: usize = 4;
+    let names = calibration.params.iter().map(|param| param.name);
+    Printed {
+        lens: LensFile::of(&calibration.intrinsics),
+        coefficients: names.skip(N_PINHOLE_PARAMS).collect(),
+        rms_px: calibration.rms_px,
+        noise_px: calibration.noise_px,
+        sigma: calibration.params.iter().map(|param| (param.name, param.sigma)).collect(),
+        rejected,
+        images: calibration
+            .images
+            .iter()
+            .map(|image| PrintedImage { image: &image.name, n_corners: image.points.len(), rms_px: image.rms_px })
+            .collect(),
+        coverage: grid(&calibration.coverage),
+        projection_sigma_px: grid(&calibration.uncertainty_px),
+        trials: calibration.trials.iter().map(trial).collect(),
+        next_view: calibration.next_view.as_ref().map(|next| &*next.instruction),
+    }
+}
+
+fn grid<T: Clone>(grid: &ImageGrid<T>) -> PrintedGrid<T> {
+    PrintedGrid { columns: grid.n_columns, rows: grid.n_rows, values: grid.values.clone() }
+}
+
+fn trial(trial: &LensTrial) -> PrintedTrial<'_> {
+    let LensTrial { baseline, variant, gain_db, standard_error_db, kept, .. } = trial;
+    PrintedTrial { baseline, variant, gain_db: *gain_db, standard_error_db: *standard_error_db, kept: *kept }
+}
+
+fn describe(printed: &Printed<'_>) -> anyhow::Result<()> {
+    let Printed { lens, sigma, rms_px, images, rejected, .. } = printed;
+    let n_corners: usize = images.iter().map(|image| image.n_corners).sum();
+    let [width, height] = lens.size_px.unwrap_or_default();
+    print::line(format!(
+        "{} of {width}x{height} pixels, {} images with {n_corners} corners, RMS error {rms_px:.3} px",
+        lens.model_name(),
+        images.len()
+    ))?;
+    let with_sigma = |name: &str, value: f64| match sigma.get(name) {
+        Some(sigma) => format!("{value:.3} +- {sigma:.3}"),
+        None => format!("{value:.3}"),
+    };
+    let [fx, fy] = lens.focal_px;
+    let [cx, cy] = lens.principal_px;
+    print::line(format!("focal lengths    {}, {} px", with_sigma("fx", fx), with_sigma("fy", fy)))?;
+    print::line(format!("principal point  {}, {} px", with_sigma("cx", cx), with_sigma("cy", cy)))?;
+    if !lens.distortion.is_empty() {
+        let distortion: Vec<String> = lens.distortion.iter().map(|value| format!("{value:.5}")).collect();
+        print::line(format!("distortion       {}", distortion.join(", ")))?;
+    }
+    let sigmas = printed.projection_sigma_px.values.iter().flatten();
+    let worst = sigmas.fold(0.0f64, |worst, sigma| worst.max(*sigma));
+    print::line(format!("projection       within {worst:.2} px everywhere (standard deviation at the worst place)"))?;
+    for rejection in rejected {
+        print::line(format!("not used: {}: {}", rejection.image, rejection.reason))?;
+    }
+    if let Some(next) = printed.next_view {
+        print::line(format!("next image: {next}"))?;
+    }
+    print::line(format!("rig file:\nintrinsics = {}", lens.to_toml()))?;
+    Ok(())
+}

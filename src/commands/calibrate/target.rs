@@ -1,0 +1,45 @@
+//! `fieldrig calibrate target`: writes a calibration target to print.
+
+use super::target_argument;
+use crate::exit::BadArgument;
+use crate::print;
+use anyhow::Context;
+use std::path::PathBuf;
+use targets::{Paper, TargetSpec};
+
+/// Fits on A4 and letter paper, and can be identified if parts of it are hidden.
+const DEFAULT_TARGET: &str = "charuco:5x7:34mm:26mm:5X5_100";
+
+/// Flags of `calibrate target`.
+#[derive(Debug, clap::Args)]
+pub(crate) struct Args {
+    /// What to draw: chessboard:9x6:25mm (inner corners), charuco:5x7:34mm:26mm:5X5_100 (squares, square, marker,
+    /// dictionary), aprilgrid:6x6:20mm:0.3 (tags, tag, gap relative to the tag), puzzleboard:12x9:20mm (squares) or
+    /// tag:36h11:5:100mm (id, side)
+    #[arg(long, value_name = "SPEC", default_value = DEFAULT_TARGET, value_parser = target_argument)]
+    target: TargetSpec,
+    /// PDF file to write; must not exist
+    #[arg(long, value_name = "FILE.pdf")]
+    out: PathBuf,
+    /// Paper: a4, a3, a2, a1, a0, letter, or a size such as 300x400mm
+    #[arg(long, value_name = "PAPER", default_value = "a4")]
+    paper: String,
+}
+
+/// Writes the PDF file.
+pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
+    let bad = |error: targets::PrintError| BadArgument(error.to_string());
+    let paper: Paper = args.paper.parse().map_err(bad)?;
+    let pdf = args.target.pdf(paper).map_err(bad)?;
+    if args.out.exists() {
+        return Err(BadArgument(format!("{} exists", args.out.display())).into());
+    }
+    std::fs::write(&args.out, pdf).with_context(|| format!("cannot write {}", args.out.display()))?;
+    print::line(format!(
+        "{}: print it at 100 % (no scaling), measure the ruler, and fix it to something flat.\nCalibrate with \
+         --target {}",
+        args.out.display(),
+        args.target
+    ))?;
+    Ok(())
+}
