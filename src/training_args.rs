@@ -79,7 +79,7 @@ fn max_bytes(text: &str) -> Result<u64, String> {
 }
 
 /// Parses a value of `--refine`.
-pub(crate) fn refine() -> impl TypedValueParser<Value = Refine> {
+fn refine() -> impl TypedValueParser<Value = Refine> {
     let find = |name: String| Refine::ALL.into_iter().find(|(known, _)| *known == name).map(|(_, refine)| refine);
     PossibleValuesParser::new(Refine::ALL.map(|(name, _)| name))
         .try_map(move |name| find(name).ok_or("unknown parameter"))

@@ -139,9 +139,16 @@ fn is_as_good(latest: &Alignment, newer: &Alignment, keyframes: &[Arc<Keyframe>]
         return false;
     }
     let agrees = |keyframe: &Arc<Keyframe>| {
-        let [latest, newer] = [latest, newer].map(|alignment| alignment.camera(keyframe, None).world_from_camera);
-        let motion = latest.inverse() * newer;
-        motion.rotation.angle() < COLOR_ACCURACY_RAD && motion.translation.vector.norm() < COLOR_ACCURACY_M
+        let [latest, newer] = [latest, newer].map(|alignment| alignment.camera(keyframe, None));
+        let motion = latest.world_from_camera.inverse() * newer.world_from_camera;
+        let has_same_lens = (0..2).all(|axis| {
+            let focal = (latest.focal_px[axis] / newer.focal_px[axis]).ln().abs();
+            let principal = (latest.principal_px[axis] - newer.principal_px[axis]).abs() / newer.focal_px[axis];
+            focal.max(principal) < COLOR_ACCURACY_RAD
+        });
+        let is_same_pose =
+            motion.rotation.angle() < COLOR_ACCURACY_RAD && motion.translation.vector.norm() < COLOR_ACCURACY_M;
+        is_same_pose && has_same_lens
     };
     !newer.has_corrections() || keyframes.iter().all(agrees)
 }

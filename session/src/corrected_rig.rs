@@ -86,18 +86,29 @@ fn other_robot(rig: &Rig, file: &Path) -> Option<PathBuf> {
 }
 
 /// Writes a rig file atomically, and the robot's URDF next to it. A file that it replaces is kept with the extension
-/// `.old`. Does not overwrite the URDF of another robot.
+/// `.old`, or `.old2` and so on if that exists. Does not overwrite the URDF of another robot.
 pub fn write(rig: &Rig, file: &Path) -> crate::Result<()> {
     check_target_file(rig, file)?;
     let urdf = file.with_file_name(drivers::recording::URDF_FILE);
     let in_file = || format!("cannot write {}", file.display());
-    std::fs::write(&urdf, &rig.arm.urdf_text).with_context(in_file)?;
+    if !urdf.exists() {
+        std::fs::write(&urdf, &rig.arm.urdf_text).with_context(in_file)?;
+    }
     if file.exists() {
-        let mut old = file.as_os_str().to_owned();
-        old.push(".old");
-        std::fs::copy(file, old).with_context(in_file)?;
+        std::fs::copy(file, unused_backup(file)).with_context(in_file)?;
     }
     run_folder::write_atomic(file, &rig.to_toml()).with_context(in_file)
+}
+
+/// Path of a backup that does not exist yet.
+fn unused_backup(file: &Path) -> PathBuf {
+    let with = |suffix: String| {
+        let mut path = file.as_os_str().to_owned();
+        path.push(suffix);
+        PathBuf::from(path)
+    };
+    let numbered = (2..).map(|number: u32| with(format!(".old{number}")));
+    std::iter::once(with(".old".to_owned())).chain(numbered).find(|path| !path.exists()).expect("an unused number")
 }
 
 /// Applies a correction. `estimates` contain the standard deviation of the time offset, if it is known; `source` names

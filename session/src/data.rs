@@ -232,7 +232,7 @@ impl Data {
         self.keyframes.iter().map(key).zip(self.names.iter().cloned()).collect()
     }
 
-    /// What the data permit to estimate.
+    /// Properties of the data that limit which parameters can be estimated.
     pub fn available(&self) -> AvailableData {
         let n_cameras = self.keyframes.iter().map(|keyframe| &keyframe.camera).collect::<HashSet<_>>().len();
         AvailableData {

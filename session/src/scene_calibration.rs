@@ -3,8 +3,8 @@
 use crate::corrected_rig;
 use crate::training_options::{Refine, TrainingOptions};
 use crate::{Data, Error};
-use calibration::Alignment;
-use capture::config::Rig;
+use calibration::{Alignment, CameraRefinement, ParamSet};
+use capture::config::{Parent, Rig};
 use keyframe::{Keyframe, Split, counted};
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -14,52 +14,108 @@ use std::sync::Arc;
 pub struct SceneCalibration {
     /// Estimates with their standard deviations, and the trials that accepted or rejected them.
     pub alignment: Alignment,
-    /// The rig with the accepted corrections; `None` if the data have no rig file.
+    /// The rig with the accepted corrections; `None` without a rig. Cameras in `refused` keep their extrinsics.
     pub rig: Option<Rig>,
-    /// Why the extrinsics cannot be determined; `None` if they can.
-    pub refused: Option<String>,
+    /// Cameras whose extrinsics the motion does not determine, with the reason.
+    pub refused: BTreeMap<String, String>,
 }
 
+impl SceneCalibration {
+    /// Whether there is no camera whose extrinsics are determined.
+    pub fn is_refused(&self, data: &Data) -> bool {
+        data.keyframes.iter().all(|keyframe| self.refused.contains_key(&*keyframe.camera))
+    }
+}
+
+/// The parameters that [`calibrate_scene`] can estimate, and `auto`.
+pub const SCENE_PARAMS: [Refine; 8] = [
+    Refine::Auto,
+    Refine::Extrinsics,
+    Refine::TimeOffset,
+    Refine::Lens,
+    Refine::Joints,
+    Refine::DepthPose,
+    Refine::DepthScale,
+    Refine::Readout,
+];
+
 /// Estimates calibration parameters from keyframes: those of `params`, or with [`Refine::Auto`] all that improve the
-/// prediction of validation images.
+/// prediction of validation images. Test images are used for the estimation, too.
 ///
-/// Test images are not needed here, so all images are used.
+/// * `rig`: the rig to correct, without settings that only apply to these data.
 ///
 /// # Errors
 ///
 /// If a parameter cannot be estimated from these data, or if too few images overlap.
-pub fn calibrate_scene(data: &Data, params: &[Refine]) -> Result<SceneCalibration, Error> {
+pub fn calibrate_scene(data: &Data, params: &[Refine], rig: Option<&Rig>) -> Result<SceneCalibration, Error> {
     let options = TrainingOptions { refine: params.to_vec(), ..TrainingOptions::default() };
-    let choice = options.refining(data.available(), Refine::Auto)?.align;
-    let keyframes: Vec<_> = data.keyframes.iter().map(with_its_use).collect();
+    let choice = match options.refining(data.available(), Refine::Auto) {
+        Ok(settings) => without_image_poses(settings.align),
+        Err(Error::BadInput(reason)) => return Err(Error::BadInput(reason.replace("--refine", "--params"))),
+        Err(error) => return Err(error),
+    };
+    let keyframes: Vec<_> = data.keyframes.iter().map(for_calibration).collect();
     let Some(alignment) = calibration::align(&keyframes, &choice) else {
         let n_images = counted(data.keyframes.len() as u64, "image");
-        let depth =
-            if data.has_depth() { "" } else { " and have texture; without depth, at least 10 are needed per camera" };
+        let needed =
+            if data.has_depth() { "" } else { " or have texture; without depth, each camera needs at least 10 images" };
         return Err(Error::InsufficientData(format!(
-            "the cameras cannot be calibrated from {n_images}: too few of them show the same surfaces{depth}. Move the camera around the scene, and turn it about all of its axes"
+            "the cameras cannot be calibrated from {n_images}: too few of them show the same surfaces{needed}. Move the camera around the scene, and turn it about all of its axes"
         )));
     };
-    let rig = data.rig.as_ref().map(|rig| corrected_rig::corrected(rig, Some(&alignment), &BTreeMap::new()));
-    let refused = refusal(&alignment);
-    Ok(SceneCalibration { rig: rig.transpose()?, alignment, refused })
+    let mut refused: BTreeMap<String, Vec<String>> = BTreeMap::new();
+    for direction in &alignment.unobservable {
+        for camera in &direction.moves_cameras {
+            refused.entry(camera.clone()).or_default().push(direction.to_string());
+        }
+    }
+    let reason = |(camera, directions): (String, Vec<String>)| {
+        let text = refusal(&directions, rig.and_then(|rig| rig.cameras.iter().find(|other| *other.name == *camera)));
+        (camera, text)
+    };
+    let refused: BTreeMap<String, String> = refused.into_iter().map(reason).collect();
+    let rig = rig.map(|given| corrected(given, &alignment, &refused)).transpose()?;
+    Ok(SceneCalibration { alignment, rig, refused })
 }
 
-/// A test keyframe becomes a training keyframe.
-fn with_its_use(keyframe: &Arc<Keyframe>) -> Arc<Keyframe> {
+/// A rig file has no keys for the poses of images.
+fn without_image_poses(choice: CameraRefinement) -> CameraRefinement {
+    let without = |set: ParamSet| set - ParamSet::IMAGE_POSES;
+    match choice {
+        CameraRefinement::Always(set) => CameraRefinement::Always(without(set)),
+        CameraRefinement::Try(sets) => {
+            CameraRefinement::Try(sets.into_iter().map(without).filter(|set| !set.is_empty()).collect())
+        }
+        CameraRefinement::AlwaysAndTry(set, sets) => CameraRefinement::AlwaysAndTry(
+            without(set),
+            sets.into_iter().map(without).filter(|set| !set.is_empty()).collect(),
+        ),
+    }
+}
+
+/// The keyframe; test keyframes become training keyframes.
+fn for_calibration(keyframe: &Arc<Keyframe>) -> Arc<Keyframe> {
     match keyframe.split {
         Split::Test => Arc::new(Keyframe { split: Split::Train, ..(**keyframe).clone() }),
         Split::Train | Split::Validation => keyframe.clone(),
     }
 }
 
-fn refusal(alignment: &Alignment) -> Option<String> {
-    let of_cameras = alignment.unobservable.iter().filter(|direction| direction.only_extrinsics);
-    let directions: Vec<String> = of_cameras.map(ToString::to_string).collect();
-    (!directions.is_empty()).then(|| {
-        format!(
-            "the motion does not determine the {}; turn the camera about at least two axes, by 20 degrees or more",
-            directions.join(", and not the ")
-        )
-    })
+fn refusal(directions: &[String], camera: Option<&capture::config::Camera>) -> String {
+    let advice = match camera.map(|camera| camera.parent) {
+        None | Some(Parent::Flange) => "turn the camera about at least two axes, by 20 degrees or more",
+        Some(Parent::Base) => "a base that turns only about one axis cannot determine it; use a target",
+        Some(Parent::World) => "the camera does not move, so it must see surfaces that moving cameras see, too",
+    };
+    format!("the motion does not determine: {}; {advice}", directions.join("; "))
+}
+
+fn corrected(given: &Rig, alignment: &Alignment, refused: &BTreeMap<String, String>) -> Result<Rig, Error> {
+    let mut rig = corrected_rig::corrected(given, Some(alignment), &BTreeMap::new())?;
+    for (camera, before) in rig.cameras.iter_mut().zip(&given.cameras) {
+        if refused.contains_key(&*camera.name) {
+            camera.parent_from_camera = before.parent_from_camera;
+        }
+    }
+    Ok(rig)
 }

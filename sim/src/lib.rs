@@ -56,8 +56,7 @@ pub mod layout {
 }
 
 pub use config::{
-    BaseConfig, CameraConfig, Config, DepthConfig, DepthSensor, Parent, ScannerConfig, Scene, SensorConfig,
-    StampConfig,
+    BaseConfig, CameraConfig, Config, DepthConfig, DepthSensor, Parent, ScannerConfig, Scene, SensorConfig, StampConfig,
 };
 pub use error::Error;
 pub use live::{LiveRig, LiveTruth};

@@ -62,7 +62,8 @@ pub(crate) fn depth_counts(
     ideal: bool,
 ) -> Vec<u16> {
     let in_range = |meters: f32| f64::from(meters) >= depth.min_m && f64::from(meters) <= depth.max_m;
-    let to_count = |meters: f64| ((meters / (depth.factor * depth.meters_per_count)).clamp(0.0, f64::from(u16::MAX)) + 0.5) as u16;
+    let to_count =
+        |meters: f64| ((meters / (depth.factor * depth.meters_per_count)).clamp(0.0, f64::from(u16::MAX)) + 0.5) as u16;
     if ideal {
         return depth_m.iter().map(|&meters| if in_range(meters) { to_count(meters.into()) } else { 0 }).collect();
     }

@@ -2,6 +2,8 @@
 
 use crate::ParamSet;
 use keyframe::Keyframe;
+use kinematics::Twist;
+use nalgebra::Vector3;
 
 /// Typical magnitudes of calibration errors. They set the damping of the solver and determine which directions count as
 /// observable.
@@ -67,6 +69,24 @@ pub(super) struct CameraParamOffsets {
     pub(super) lens: Option<usize>,
     pub(super) depth_scale: Option<usize>,
     pub(super) readout: Option<usize>,
+}
+
+impl CameraParamOffsets {
+    /// Motions of a camera, in its own axes, per unit of its extrinsics and time offset: parameter index, meters,
+    /// radians.
+    ///
+    /// * `twist`: velocity of the camera in its own axes, if known.
+    pub(super) fn motions(&self, twist: Option<&Twist>) -> Vec<(usize, Vector3<f64>, Vector3<f64>)> {
+        let mut motions = Vec::new();
+        if let Some(extrinsics) = self.extrinsics {
+            motions.extend((0..3).map(|axis| (extrinsics + axis, Vector3::ith(axis, 1.0), Vector3::zeros())));
+            motions.extend((0..3).map(|axis| (extrinsics + 3 + axis, Vector3::zeros(), Vector3::ith(axis, 1.0))));
+        }
+        if let (Some(time_offset), Some(twist)) = (self.time_offset, twist) {
+            motions.push((time_offset, twist.linear_m_s, twist.angular_rad_s));
+        }
+        motions
+    }
 }
 
 impl Layout {

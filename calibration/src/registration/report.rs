@@ -11,7 +11,7 @@ use keyframe::Keyframe;
 use kinematics::{Stamp, Transform};
 use nalgebra::{DVector, Vector3};
 use serde::{Deserialize, Serialize};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 /// Result of alignment.
@@ -121,9 +121,9 @@ pub struct ScalarEstimate {
 pub struct Unobservable {
     /// Descriptions of the parts.
     pub parts: Vec<String>,
-    /// Whether it changes only extrinsics of cameras.
+    /// Names of the cameras that it moves, if it changes only extrinsics; otherwise empty.
     #[serde(default)]
-    pub only_extrinsics: bool,
+    pub moves_cameras: Vec<String>,
 }
 
 pub(super) fn alignment(
@@ -299,9 +299,12 @@ fn describe(scene: &AlignmentScene, params: &[CalibrationParam], direction: &DVe
             _ => None,
         });
     }
-    let is_extrinsics = |ix: usize| matches!(params[ix], CalibrationParam::Extrinsics(..));
-    let only_extrinsics = (0..params.len()).all(|ix| is_extrinsics(ix) || !is_significant(ix, 1));
-    Unobservable { parts, only_extrinsics }
+    let moved = (0..params.len()).filter(|ix| is_significant(*ix, 1)).map(|ix| match params[ix] {
+        CalibrationParam::Extrinsics(camera, _) => Some(scene.cameras[camera].to_string()),
+        _ => None,
+    });
+    let moves_cameras: Option<BTreeSet<String>> = moved.collect();
+    Unobservable { parts, moves_cameras: moves_cameras.unwrap_or_default().into_iter().collect() }
 }
 
 impl Alignment {

@@ -61,19 +61,12 @@ impl CorrectedView {
         let posed = correction.apply(keyframe);
         let raw_from_corrected = keyframe.world_from_camera.inverse() * posed.world_from_camera;
         let params = layout.of_camera(image.camera);
-        let mut columns = Vec::new();
-        if let Some(extrinsics) = params.extrinsics {
-            let unit = |axis: usize| Vector3::from_fn(|row, _| if row == axis { 1.0 } else { 0.0 });
-            columns.extend((0..3).map(|axis| (extrinsics + axis, unit(axis), Vector3::zeros())));
-            columns.extend((0..3).map(|axis| (extrinsics + 3 + axis, Vector3::zeros(), unit(axis))));
-        }
+        let twist_of_corrected = keyframe.twist.map(|twist| twist.of_attached(&raw_from_corrected));
+        let mut columns = params.motions(twist_of_corrected.as_ref());
         let mut add_column = |param: usize, twist: &Twist, camera_from_twist: &Transform| {
             let twist = twist.of_attached(camera_from_twist);
             columns.push((param, twist.linear_m_s, twist.angular_rad_s));
         };
-        if let (Some(time_offset), Some(twist)) = (params.time_offset, &keyframe.twist) {
-            add_column(time_offset, twist, &raw_from_corrected);
-        }
         if let Some(joints) = layout.joints() {
             let time_corrected_from_corrected = correction.time_corrected_from_input(keyframe) * raw_from_corrected;
             for (joint, twist) in keyframe.joint_twists.iter().enumerate() {

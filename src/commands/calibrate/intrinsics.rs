@@ -5,10 +5,9 @@ use super::lens::LensFile;
 use super::target_argument;
 use crate::exit::{Exit, InsufficientData};
 use crate::print;
-use calibration::intrinsics::{
-    ImageGrid, IntrinsicsCalibration, IntrinsicsInput, LensModel, LensTrial, calibrate_intrinsics,
+use calibration::{
+    BoardView, ImageGrid, IntrinsicsCalibration, IntrinsicsInput, LensModel, LensTrial, calibrate_intrinsics,
 };
-use calibration::BoardView;
 use serde::Serialize;
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -114,17 +113,28 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     if views.is_empty() {
         // All images usually fail for the same reason.
         let reason = rejected.first().map_or(String::new(), |first| format!("; {}: {}", first.image, first.reason));
-        let text = format!("{}: {} was detected in none of {} images{reason}", args.folder.display(), args.target, rejected.len());
+        let text = format!(
+            "{}: {} was detected in none of {} images{reason}",
+            args.folder.display(),
+            args.target,
+            rejected.len()
+        );
         return Err(InsufficientData(text).into());
     }
     let input = IntrinsicsInput { views: &views, sizes_px: &sizes_px, model: args.model.into() };
     let calibration = calibrate_intrinsics(&input)?;
-    rejected.extend(calibration.rejected.iter().map(|rejected| PrintedRejection {
-        image: rejected.image.clone(),
-        reason: rejected.reason.to_string(),
-    }));
+    rejected.extend(
+        calibration
+            .rejected
+            .iter()
+            .map(|rejected| PrintedRejection { image: rejected.image.clone(), reason: rejected.reason.to_string() }),
+    );
     let printed = printed(&calibration, rejected);
-    if args.json { print::json(&printed)? } else { describe(&printed)? }
+    if args.json {
+        print::json(&printed)?
+    } else {
+        describe(&printed)?
+    }
     Ok(Exit::Done)
 }
 

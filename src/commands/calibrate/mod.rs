@@ -1,9 +1,15 @@
 //! `fieldrig calibrate`: calibrates cameras, with a printed target or from images of any static scene.
 
+mod images;
+mod intrinsics;
+mod lens;
 mod scene;
+mod target;
 
 use crate::exit::Exit;
 use clap::{Parser, Subcommand};
+use kinematics::{Transform, transform};
+use targets::TargetSpec;
 
 /// Flags of `calibrate`.
 #[derive(Debug, Parser)]
@@ -14,6 +20,10 @@ pub(crate) struct Args {
 
 #[derive(Debug, Subcommand)]
 enum CalibrateCommand {
+    /// Write a calibration target to print
+    Target(target::Args),
+    /// Lens of a camera from images of a target
+    Intrinsics(intrinsics::Args),
     /// Hand-eye transform, time offset, lens, joint and depth errors of a rig from images of a static scene, without a
     /// target
     Scene(scene::Args),
@@ -21,6 +31,33 @@ enum CalibrateCommand {
 
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     match &args.command {
+        CalibrateCommand::Target(args) => target::run(args).map(|()| Exit::Done),
+        CalibrateCommand::Intrinsics(args) => intrinsics::run(args),
         CalibrateCommand::Scene(args) => scene::run(args),
     }
+}
+
+/// Parses the specification of a target.
+fn target_argument(text: &str) -> Result<TargetSpec, String> {
+    text.parse().map_err(|error: targets::SpecError| error.to_string())
+}
+
+/// The matrix of a transform, row by row.
+fn matrix_of(transform: &Transform) -> [[f64; 4]; 4] {
+    let rows = transform::to_rows(transform);
+    std::array::from_fn(|row| std::array::from_fn(|column| rows[4 * row + column]))
+}
+
+/// The transform of a matrix in JSON: four lists of four numbers, or one list of 16, row by row.
+fn transform_of(value: &serde_json::Value) -> Result<Transform, String> {
+    let flat: Vec<&serde_json::Value> = match value.as_array() {
+        Some(rows) => {
+            rows.iter().flat_map(|row| row.as_array().map_or(vec![row], |row| row.iter().collect())).collect()
+        }
+        None => Vec::new(),
+    };
+    let numbers: Option<Vec<f64>> = flat.into_iter().map(serde_json::Value::as_f64).collect();
+    let numbers: Option<[f64; 16]> = numbers.and_then(|numbers| numbers.try_into().ok());
+    let numbers = numbers.ok_or("must be a matrix of 4 x 4 numbers, row by row")?;
+    transform::from_rows(&numbers).map_err(|error| error.to_string())
 }

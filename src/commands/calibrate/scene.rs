@@ -1,17 +1,17 @@
 //! `fieldrig calibrate scene`: calibrates the cameras of a rig from images of a static scene.
 
+use super::matrix_of;
 use crate::console::ReadBar;
-use crate::data_args::DataArgs;
 use crate::exit::{self, BadArgument, Exit, InsufficientData};
-use crate::training_args::refine;
 use crate::{print, signals};
 use calibration::{Estimate, Trial};
 use capture::config::{Override, Rig};
 use capture::open::{self, Devices};
 use drivers::Sample;
-use kinematics::{Stamp, Transform};
+use keyframe::listed;
+use kinematics::Stamp;
 use serde::Serialize;
-use session::{Data, Purpose, Refine, SceneCalibration, calibrate_scene, corrected_rig};
+use session::{Data, DataOptions, Purpose, Refine, SCENE_PARAMS, SceneCalibration, calibrate_scene, corrected_rig};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
@@ -24,11 +24,15 @@ pub(crate) struct Args {
     /// Recording (.mcap), nerfstudio or TUM RGB-D folder, or rig file (.toml) whose devices are read
     #[arg(value_name = "RIG|DATA")]
     input: PathBuf,
-    #[command(flatten)]
-    images: DataArgs,
+    /// Use exactly the keyframes listed by an earlier run (keyframes.txt)
+    #[arg(long, value_name = "FILE")]
+    keyframes: Option<PathBuf>,
+    /// Read a recording with this rig file instead of the one stored in it
+    #[arg(long, value_name = "FILE")]
+    rig: Option<PathBuf>,
     /// What to estimate: auto (the parameters that improve the prediction of validation images), or a list of
     /// extrinsics, time-offset, lens and, with depth, joints, depth-pose, depth-scale and readout
-    #[arg(long, value_name = "PARAMS", value_delimiter = ',', hide_possible_values = true, value_parser = refine(), default_value = "auto")]
+    #[arg(long, value_name = "PARAMS", value_delimiter = ',', default_value = "auto", value_parser = scene_param)]
     params: Vec<Refine>,
     /// With a rig file: simulate all devices
     #[arg(long)]
@@ -54,11 +58,16 @@ struct Printed<'a> {
     trials: &'a [Trial],
     /// Directions in parameter space that the motion does not determine.
     unobservable: Vec<String>,
-    refused: Option<&'a str>,
+    /// Why no camera could be calibrated.
+    refused: Option<String>,
 }
 
 #[derive(Debug, Serialize)]
 struct PrintedCamera {
+    /// Number of images used.
+    n_images: usize,
+    /// Why its extrinsics are those of the rig file.
+    refused: Option<String>,
     parent_from_camera: [[f64; 4]; 4],
     focal_px: [f64; 2],
     principal_px: [f64; 2],
@@ -66,49 +75,78 @@ struct PrintedCamera {
     stamp_to_mid_exposure_millis: Option<f64>,
 }
 
-/// Calibrates and prints the estimates. Exit code 4 if the data do not determine the extrinsics.
+/// Calibrates and prints the estimates. Exit code 4 if the data do not determine the extrinsics of any camera.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
-    let data = args.data()?;
-    if let (Some(file), None) = (&args.write_rig, &data.rig) {
-        let input = args.input.display();
-        return Err(BadArgument(format!("--write-rig {}: {input} contains no rig file", file.display())).into());
-    }
-    if let (Some(file), Some(rig)) = (&args.write_rig, &data.rig) {
+    let given = args.rig_as_given()?;
+    if let Some(file) = &args.write_rig {
+        let Some(rig) = &given else {
+            let input = args.input.display();
+            return Err(BadArgument(format!("--write-rig {}: {input} contains no rig file", file.display())).into());
+        };
         corrected_rig::check_target_file(rig, file)?;
     }
-    let calibration = calibrate_scene(&data, &args.params)?;
-    let printed = printed(&data, &calibration);
+    let data = args.data()?;
+    // Devices may report calibration that the rig file does not contain.
+    let rig = if args.sim || data.rig.is_none() || !is_rig_file(&args.input) { given } else { data.rig.clone() };
+    let calibration = calibrate_scene(&data, &args.params, rig.as_ref())?;
+    let exit = exit::from_losses(&data.data_losses);
+    let is_refused = calibration.is_refused(&data);
+    let printed = printed(&data, &calibration, is_refused);
     if args.json {
         print::json(&printed)?;
     } else {
-        describe(&printed, &calibration)?;
+        describe(&printed, &calibration, args.params == [Refine::Auto])?;
     }
-    if let Some(reason) = calibration.refused {
-        return if args.json { Ok(Exit::InsufficientData) } else { Err(InsufficientData(reason).into()) };
+    if is_refused {
+        return if args.json {
+            Ok(Exit::InsufficientData)
+        } else {
+            Err(InsufficientData(printed.refused.unwrap_or_default()).into())
+        };
     }
-    if let (Some(file), Some(rig)) = (&args.write_rig, &calibration.rig) {
-        corrected_rig::write(rig, file)?;
-        log::info!("rig file written to {}", file.display());
+    if let (Some(file), Some(before), Some(after)) = (&args.write_rig, &rig, &calibration.rig) {
+        if after.has_same_calibration(before) {
+            log::info!("no correction was accepted: {} is not written", file.display());
+        } else {
+            corrected_rig::write(after, file)?;
+            log::info!("rig file written to {}", file.display());
+        }
     }
-    Ok(exit::from_losses(&data.data_losses))
+    Ok(exit)
+}
+
+fn scene_param(text: &str) -> Result<Refine, String> {
+    SCENE_PARAMS.into_iter().find(|param| param.name() == text).ok_or_else(|| {
+        let names = SCENE_PARAMS.map(Refine::name);
+        format!("unknown parameter {text:?}, expected {}", listed(&names, "or"))
+    })
 }
 
 impl Args {
-    fn data(&self) -> anyhow::Result<Data> {
+    fn options(&self) -> DataOptions {
+        DataOptions { keyframes: self.keyframes.clone(), rig: self.rig.clone(), ..DataOptions::default() }
+    }
+
+    /// The rig file, without settings that apply only to this command; `None` for a folder.
+    fn rig_as_given(&self) -> anyhow::Result<Option<Rig>> {
         session::expect(&self.input)?;
+        if is_rig_file(&self.input) {
+            return Ok(Some(Rig::load(&self.input, &[])?));
+        }
+        let is_recording = session::run_folder::is_recording(&self.input);
+        Ok(is_recording.then(|| Data::rig_as_given(&self.input, &self.options())).transpose()?)
+    }
+
+    fn data(&self) -> anyhow::Result<Data> {
         let bar = ReadBar::new(self.json);
         if !is_rig_file(&self.input) {
             if self.sim || self.seconds.is_some() {
                 return Err(BadArgument("--sim and --seconds need a rig file (.toml) as input".into()).into());
             }
-            let options = self.images.options();
-            return Ok(Data::load(&self.input, &options, Purpose::Training, &[], &|read| bar.show(read))?);
+            return Ok(Data::load(&self.input, &self.options(), Purpose::Training, &[], &|read| bar.show(read))?);
         }
-        if !self.images.options().flags().is_empty() {
-            return Err(BadArgument(
-                "--holdout, --keyframes, --rig and --scale need a recording or a folder as input".into(),
-            )
-            .into());
+        if self.keyframes.is_some() || self.rig.is_some() {
+            return Err(BadArgument("--keyframes and --rig need a recording as input".into()).into());
         }
         let stop = signals::stop_on_signals_logging("calibrating with the images so far; Ctrl-C again exits at once")?;
         let overrides = if self.sim { vec![Override::new("sim.lockstep", true)] } else { Vec::new() };
@@ -128,10 +166,12 @@ fn is_rig_file(path: &Path) -> bool {
     path.extension().is_some_and(|extension| extension == "toml")
 }
 
-fn printed<'a>(data: &Data, calibration: &'a SceneCalibration) -> Printed<'a> {
+fn printed<'a>(data: &Data, calibration: &'a SceneCalibration, is_refused: bool) -> Printed<'a> {
     let cameras = calibration.rig.iter().flat_map(|rig| &rig.cameras).map(|camera| {
         let printed = PrintedCamera {
-            parent_from_camera: rows(&camera.parent_from_camera),
+            n_images: data.keyframes.iter().filter(|keyframe| *keyframe.camera == *camera.name).count(),
+            refused: calibration.refused.get(&*camera.name).cloned(),
+            parent_from_camera: matrix_of(&camera.parent_from_camera),
             focal_px: camera.intrinsics.focal_px,
             principal_px: camera.intrinsics.principal_px,
             stamp_to_mid_exposure_millis: camera.stamp_to_mid_exposure.as_ref().map(|offset| offset.value_millis),
@@ -139,32 +179,37 @@ fn printed<'a>(data: &Data, calibration: &'a SceneCalibration) -> Printed<'a> {
         (&*camera.name, printed)
     });
     let alignment = &calibration.alignment;
+    let reasons = calibration.refused.iter().map(|(camera, reason)| format!("camera {camera:?}: {reason}"));
     Printed {
         n_images: data.keyframes.len(),
         cameras: cameras.collect(),
         estimates: &alignment.estimates,
         trials: &alignment.trials,
         unobservable: alignment.unobservable.iter().map(ToString::to_string).collect(),
-        refused: calibration.refused.as_deref(),
+        refused: is_refused.then(|| reasons.collect::<Vec<_>>().join("; ")),
     }
 }
 
-/// The matrix of a transform, as rows.
-fn rows(transform: &Transform) -> [[f64; 4]; 4] {
-    let matrix = transform.to_homogeneous();
-    std::array::from_fn(|row| std::array::from_fn(|column| matrix[(row, column)]))
-}
-
-fn describe(printed: &Printed<'_>, calibration: &SceneCalibration) -> anyhow::Result<()> {
-    print::line(format!("{} images, {} pairs", printed.n_images, calibration.alignment.n_pairs))?;
-    for line in calibration.alignment.lines() {
+fn describe(printed: &Printed<'_>, calibration: &SceneCalibration, is_auto: bool) -> anyhow::Result<()> {
+    let alignment = &calibration.alignment;
+    print::line(format!("{} images", printed.n_images))?;
+    for line in alignment.lines() {
         print::line(line)?;
     }
-    if printed.estimates.is_empty() {
-        print::line("nothing to correct: no parameter improves the prediction of validation images")?;
+    if !is_auto && alignment.trials.iter().any(|trial| !trial.kept) {
+        log::warn!("the corrections are applied as requested, but validation images do not confirm all of them");
+    }
+    if printed.estimates.is_empty() && printed.refused.is_none() {
+        print::line(match alignment.has_enough_validation_images() {
+            true => "nothing to correct: no parameter improves the prediction of validation images",
+            false => "too few validation images to accept a correction; record more images",
+        })?;
     }
     for (name, camera) in &printed.cameras {
-        print::line(format!("parent_from_camera of {name}, row by row:"))?;
+        if let (Some(reason), None) = (&camera.refused, &printed.refused) {
+            log::warn!("camera {name:?} keeps its extrinsics: {reason}");
+        }
+        print::line(format!("parent_from_camera of {name}, row by row ({} images):", camera.n_images))?;
         for row in &camera.parent_from_camera {
             let row: Vec<String> = row.iter().map(|value| format!("{value:10.6}")).collect();
             print::line(format!("  {}", row.join(" ")))?;

@@ -111,55 +111,52 @@ impl PairMatches {
     ///
     /// * `noise_texels`: standard deviation of the distances.
     pub(super) fn sums(&self, cameras: &[MovingCamera], layout: &Layout, noise_texels: f64) -> PairSums {
-        sums(self, cameras, layout, noise_texels)
-    }
-}
-
-fn sums(pair: &PairMatches, cameras: &[MovingCamera], layout: &Layout, noise_texels: f64) -> PairSums {
-    let to_from_from = pair.to_from_from(cameras);
-    let pair_cameras = [&cameras[pair.pair.from], &cameras[pair.pair.to]];
-    // If both images are from one camera, its parameters change both. Parameters of the lens have no entry.
-    let mut derivatives: BTreeMap<usize, Matrix3<f64>> = BTreeMap::new();
-    for (ix, by_motion) in essential_derivatives(&to_from_from).into_iter().enumerate() {
-        for (param, translation, rotation) in pair_cameras[ix].motions(layout, pair.cameras[ix]) {
-            let parts = translation.iter().chain(&rotation).zip(&by_motion);
-            *derivatives.entry(param).or_default() +=
-                parts.map(|(length, by_part)| by_part * *length).sum::<Matrix3<f64>>();
-        }
-        for (param, _) in
-            pair_cameras[ix].ray_motions(layout, pair.cameras[ix], &Vector2::zeros()).into_iter().flatten()
-        {
-            derivatives.entry(param).or_default();
-        }
-    }
-    let (params, derivatives): (Vec<usize>, Vec<Matrix3<f64>>) = derivatives.into_iter().unzip();
-    let n = params.len();
-    let (mut information, mut gradient) = (DMatrix::zeros(n, n), DVector::zeros(n));
-    let mut row = vec![0.0; n];
-    for (found, sampson) in pair.sampsons(cameras, &to_from_from) {
-        let scale = 1.0 / (noise_texels * found.texel_rad);
-        let residual = scale * sampson.distance_rad();
-        let weight = 1.0 / (1.0 + (residual / CAUCHY_SCALE).powi(2));
-        let by_essential = sampson.derivatives() * scale;
-        row.iter_mut().zip(&derivatives).for_each(|(value, derivative)| *value = by_essential.dot(derivative));
-        for (ix, camera) in pair_cameras.into_iter().enumerate() {
-            let by_ray = sampson.gradients[ix].xy() * (scale / sampson.norm);
-            for (param, motion) in
-                camera.ray_motions(layout, pair.cameras[ix], &sampson.rays[ix].xy()).into_iter().flatten()
+        let to_from_from = self.to_from_from(cameras);
+        let pair_cameras = [&cameras[self.pair.from], &cameras[self.pair.to]];
+        // If both images are from one camera, its parameters change both. Lens parameters do not
+        // change the essential matrix; their entries are zero.
+        let mut derivatives: BTreeMap<usize, Matrix3<f64>> = BTreeMap::new();
+        for (ix, by_motion) in essential_derivatives(&to_from_from).into_iter().enumerate() {
+            for (param, translation, rotation) in pair_cameras[ix].motions(layout, self.cameras[ix]) {
+                let parts = translation.iter().chain(&rotation).zip(&by_motion);
+                *derivatives.entry(param).or_default() +=
+                    parts.map(|(length, by_part)| by_part * *length).sum::<Matrix3<f64>>();
+            }
+            for (param, _) in
+                pair_cameras[ix].ray_motions(layout, self.cameras[ix], &Vector2::zeros()).into_iter().flatten()
             {
-                row[params.partition_point(|other| *other < param)] += by_ray.dot(&motion);
+                derivatives.entry(param).or_default();
             }
         }
-        for (ix, value) in row.iter().enumerate() {
-            let weighted = weight * value;
-            gradient[ix] -= weighted * residual;
-            for (other_ix, other) in row[..=ix].iter().enumerate() {
-                information[(ix, other_ix)] += weighted * other;
+        let (params, derivatives): (Vec<usize>, Vec<Matrix3<f64>>) = derivatives.into_iter().unzip();
+        let n = params.len();
+        let (mut information, mut gradient) = (DMatrix::zeros(n, n), DVector::zeros(n));
+        let mut row = vec![0.0; n];
+        for (found, sampson) in self.sampsons(cameras, &to_from_from) {
+            let scale = 1.0 / (noise_texels * found.texel_rad);
+            let residual = scale * sampson.distance_rad();
+            let weight = 1.0 / (1.0 + (residual / CAUCHY_SCALE).powi(2));
+            let by_essential = sampson.derivatives() * scale;
+            row.iter_mut().zip(&derivatives).for_each(|(value, derivative)| *value = by_essential.dot(derivative));
+            for (ix, camera) in pair_cameras.into_iter().enumerate() {
+                let by_ray = sampson.gradients[ix].xy() * (scale / sampson.norm);
+                for (param, motion) in
+                    camera.ray_motions(layout, self.cameras[ix], &sampson.rays[ix].xy()).into_iter().flatten()
+                {
+                    row[params.partition_point(|other| *other < param)] += by_ray.dot(&motion);
+                }
+            }
+            for (ix, value) in row.iter().enumerate() {
+                let weighted = weight * value;
+                gradient[ix] -= weighted * residual;
+                for (other_ix, other) in row[..=ix].iter().enumerate() {
+                    information[(ix, other_ix)] += weighted * other;
+                }
             }
         }
+        information.fill_upper_triangle_with_lower_triangle();
+        PairSums::new(params, information, gradient)
     }
-    information.fill_upper_triangle_with_lower_triangle();
-    PairSums::new(params, information, gradient)
 }
 
 #[cfg(test)]

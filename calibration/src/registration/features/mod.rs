@@ -21,7 +21,7 @@ use super::pairs::Pair;
 use super::report::{self, Alignment};
 use super::solve::Solution;
 use super::{AlignmentScene, CalibrationModel, MAX_IMAGES, MIN_PAIRS};
-use crate::{CameraCorrection, CameraRefinement, Candidate, ParamSet, Trial, rigid_transform};
+use crate::{CameraRefinement, Candidate, ParamSet, Trial};
 use epipolar::PairMatches;
 use feature_image::FeatureImage;
 use keyframe::{Keyframe, Split};
@@ -66,6 +66,10 @@ const ROUNDS: [Round; 5] = [
     LAST_ROUND,
 ];
 const LAST_ROUND: Round = Round { rotation_rad: 0.01, translation_m: 0.004, n_partners: 12 };
+/// Matching for quick trials.
+const QUICK_ROUND: Round = Round { rotation_rad: 0.02, translation_m: 0.01, n_partners: CROSS_VALIDATION_PARTNERS };
+/// The last round is not repeated if it changed the estimate by less than this fraction of the expected error.
+const CLOSE_FRAC: f64 = 0.1;
 /// Number of groups of images for cross-validation, and number of partners of each image.
 const N_FOLDS: usize = 4;
 const CROSS_VALIDATION_PARTNERS: usize = 8;
@@ -116,23 +120,34 @@ pub(super) fn align(keyframes: &[Arc<Keyframe>], choice: &CameraRefinement) -> O
     let (mut trials, mut unobservable, mut pairs) = (Vec::new(), Vec::new(), None);
     // Matches near the epipolar lines of the kept model.
     let mut kept_matches: Option<Vec<PairMatches>> = None;
-    for set in sets {
-        let is_optional = !matches!(choice, CameraRefinement::Always(_));
-        if is_optional && !set.contains(ParamSet::EXTRINSICS) {
-            let matches = kept_matches.get_or_insert_with(|| scene.validation_matches(&kept, &kept));
+    let is_optional = !matches!(choice, CameraRefinement::Always(_));
+    for set in sets.into_iter().filter(|set| scene.layout(*set).n() > 0) {
+        let has_extrinsics = set.contains(ParamSet::EXTRINSICS);
+        if is_optional && !has_extrinsics {
+            let matches = kept_matches.get_or_insert_with(|| scene.matches(&kept.corrections, &QUICK_ROUND));
             let rejected = scene.quick_trial(set, &kept, matches).filter(|trial| trial.gain_db < MIN_QUICK_GAIN_DB);
             if let Some(trial) = rejected {
                 trials.push(Trial { kept: false, ..trial });
                 continue;
             }
         }
-        let Some((variant_pairs, variant)) = scene.model(kept.set | set, &kept) else { continue };
-        let mut trial = scene.cross_validate(set, &kept, &variant, &scene.validation_matches(&kept, &variant));
+        let Some((variant_pairs, mut variant)) = scene.model(kept.set | set, &kept) else {
+            // Without consistent matches, other parameters cannot be judged either.
+            if has_extrinsics {
+                return None;
+            }
+            continue;
+        };
+        let matches = scene.validation_matches(&kept, &variant);
+        let mut trial = scene.cross_validate(set, &kept, &variant, &matches);
         trial.kept &= trial.gain_db > MIN_GAIN_DB && variant.has_significant(&scene.layout(set));
         let is_kept = trial.kept || !is_optional;
-        if is_kept || set.contains(ParamSet::EXTRINSICS) {
+        if has_extrinsics || (is_kept && variant.set.contains(ParamSet::EXTRINSICS)) {
             let summary = scene.summary(&variant_pairs);
             unobservable = variant.fit.iter().flat_map(|fit| report::unobservable(&summary, fit)).collect();
+        }
+        if is_optional {
+            scene.reset_insignificant_extrinsics(&mut variant);
         }
         if is_kept {
             (kept, pairs, kept_matches) = (variant, Some(variant_pairs), None);
@@ -141,26 +156,11 @@ pub(super) fn align(keyframes: &[Arc<Keyframe>], choice: &CameraRefinement) -> O
         }
         trials.push(trial);
     }
-    // Without any estimate, the images show nothing in common.
+    // Without any trial, the images show nothing in common.
     (!trials.is_empty()).then(|| {
         let summary = scene.summary(&pairs.unwrap_or_default());
         report::alignment(&summary, &kept, trials, unobservable)
     })
-}
-
-impl Corrections {
-    /// Whether extrinsics differ by less than a tenth of the errors that a round expects.
-    fn is_close_to(&self, other: &Self, round: &Round) -> bool {
-        const CLOSE_FRAC: f64 = 0.1;
-        self.by_camera.iter().zip(&other.by_camera).all(|(one, other)| {
-            let extrinsics = |correction: &CameraCorrection| {
-                rigid_transform(correction.rotation_rad.into(), correction.translation_m.into())
-            };
-            let change = extrinsics(one).inverse() * extrinsics(other);
-            change.rotation.angle() < CLOSE_FRAC * round.rotation_rad
-                && change.translation.vector.norm() < CLOSE_FRAC * round.translation_m
-        })
-    }
 }
 
 impl FeatureScene {
@@ -194,7 +194,7 @@ impl FeatureScene {
         Layout::new(set, &images, self.cameras.len())
     }
 
-    /// What reports need to know of the images.
+    /// The cameras and pairs, for reports.
     fn summary(&self, pairs: &[Pair]) -> AlignmentScene {
         AlignmentScene {
             images: Vec::new(),
@@ -249,7 +249,7 @@ impl FeatureScene {
     /// last round. `None` without consistent matches.
     fn model(&self, set: ParamSet, start: &CalibrationModel) -> Option<(Vec<Pair>, CalibrationModel)> {
         let mut corrections = start.corrections.clone();
-        // Once extrinsics are known, or if they are assumed to be known, the coarse rounds are not needed.
+        // Once extrinsics are known, or if they are assumed to be known, the coarsest round is not needed.
         let is_coarse = set.contains(ParamSet::EXTRINSICS) && !start.set.contains(ParamSet::EXTRINSICS);
         let rounds = if is_coarse { &ROUNDS[..] } else { &ROUNDS[1..] };
         let mut last = None;
@@ -264,7 +264,8 @@ impl FeatureScene {
                 return None;
             }
             let fit = self.fit(&matches, &layout, &corrections)?;
-            let is_close = fit.corrections.is_close_to(&corrections, round);
+            let [change_rad, change_m] = self.largest_difference(&fit.corrections, &corrections);
+            let is_close = change_rad < CLOSE_FRAC * round.rotation_rad && change_m < CLOSE_FRAC * round.translation_m;
             corrections = fit.corrections.clone();
             last = Some((matches, fit));
             if ix + 2 == rounds.len() && is_close {
@@ -319,24 +320,48 @@ impl FeatureScene {
         Some(Fit { corrections, layout: layout.clone(), solution: last?, noise: INITIAL_NOISE })
     }
 
+    /// Largest difference of an image with two corrections; see [`MovingCamera::difference`].
+    fn largest_difference(&self, one: &Corrections, other: &Corrections) -> [f64; 2] {
+        let both = self.moving_cameras(one).into_iter().zip(self.moving_cameras(other));
+        let differences = both.map(|(one, other)| one.difference(&other));
+        differences.fold([0.0; 2], |largest, difference| [0, 1].map(|ix| largest[ix].max(difference[ix])))
+    }
+
+    /// Restores the given extrinsics of cameras whose estimate is not significant.
+    fn reset_insignificant_extrinsics(&self, model: &mut CalibrationModel) {
+        for camera in 0..self.cameras.len() {
+            if model.set.contains(ParamSet::EXTRINSICS) && !model.has_significant(&Layout::extrinsics_of(camera)) {
+                let correction = &mut model.corrections.by_camera[camera];
+                (correction.rotation_rad, correction.translation_m) = ([0.0; 3], [0.0; 3]);
+            }
+        }
+    }
+
+    /// Cross-validation group of each image. The images of each camera are distributed evenly.
+    fn folds(&self) -> Vec<usize> {
+        let mut n_of_camera = vec![0; self.cameras.len()];
+        let fold_of = |image: &FeatureImage| {
+            let rank = &mut n_of_camera[image.camera];
+            *rank += 1;
+            (*rank - 1) % N_FOLDS
+        };
+        self.images.iter().map(fold_of).collect()
+    }
+
     /// Matches for comparing two models.
     fn validation_matches(&self, baseline: &CalibrationModel, variant: &CalibrationModel) -> Vec<PairMatches> {
         // The band around the epipolar lines of the baseline also contains those of the variant.
-        let largest_change = |part: fn(&CameraCorrection) -> [f64; 3]| {
-            let both = baseline.corrections.by_camera.iter().zip(&variant.corrections.by_camera);
-            let change = both.map(|(before, after)| (Vector3::from(part(after)) - Vector3::from(part(before))).norm());
-            change.fold(0.0, f64::max)
-        };
+        let [change_rad, change_m] = self.largest_difference(&baseline.corrections, &variant.corrections);
         let round = Round {
-            rotation_rad: LAST_ROUND.rotation_rad + largest_change(|correction| correction.rotation_rad),
-            translation_m: LAST_ROUND.translation_m + largest_change(|correction| correction.translation_m),
+            rotation_rad: LAST_ROUND.rotation_rad + change_rad,
+            translation_m: LAST_ROUND.translation_m + change_m,
             n_partners: CROSS_VALIDATION_PARTNERS,
         };
         self.matches(&baseline.corrections, &round)
     }
 
-    /// Evaluates a set of parameters without searching for other matches. This takes a fraction of the time, and shows
-    /// a part of the gain.
+    /// Evaluates a set of parameters with given matches. This is faster than searching for new ones, but underestimates
+    /// the gain.
     fn quick_trial(&self, set: ParamSet, baseline: &CalibrationModel, matches: &[PairMatches]) -> Option<Trial> {
         let layout = self.layout(baseline.set | set);
         let fit = self.fit(matches, &layout, &baseline.corrections).filter(|_| matches.len() >= MIN_PAIRS)?;
@@ -354,9 +379,10 @@ impl FeatureScene {
         variant: &CalibrationModel,
         matches: &[PairMatches],
     ) -> Trial {
+        let folds = self.folds();
         let [baseline_layout, variant_layout] = [baseline, variant].map(|model| self.layout(model.set));
         let of_fold = |fold: usize| {
-            let is_held_out = |image: usize| image % N_FOLDS == fold;
+            let is_held_out = |image: usize| folds[image] == fold;
             let (tested, used): (Vec<PairMatches>, Vec<PairMatches>) =
                 matches.iter().cloned().partition(|pair| is_held_out(pair.pair.from) || is_held_out(pair.pair.to));
             let fitted = |layout: &Layout, model: &CalibrationModel| match layout.n() {

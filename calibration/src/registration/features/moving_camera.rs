@@ -15,15 +15,13 @@ pub(super) struct MovingCamera {
     /// Velocity in the camera's own axes, and time from the first to the last row; zero if unknown.
     twist: Twist,
     readout_secs: f64,
-    /// The keyframe's velocity in the corrected camera's axes: the motion per second of time offset.
-    time_offset_twist: Twist,
     focal_px: [f64; 2],
     principal_px: [f64; 2],
     /// Focal lengths of the keyframe; offsets of the principal point are relative to them.
     keyframe_focal_px: [f64; 2],
 }
 
-/// Where a camera saw a corner.
+/// Ray of a corner, and position of the camera at the readout of its row.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Sighting {
     /// Direction of the corner in the axes that the camera has at mid-exposure: x and y at a depth of 1.
@@ -35,13 +33,11 @@ pub(super) struct Sighting {
 impl MovingCamera {
     pub(super) fn new(keyframe: &Keyframe, correction: &CameraCorrection) -> Self {
         let corrected = correction.apply(keyframe);
-        let raw_from_corrected = keyframe.world_from_camera.inverse() * corrected.world_from_camera;
         let shutter = corrected.shutter;
         Self {
             world_from_camera: corrected.world_from_camera,
             twist: shutter.map_or_else(Twist::zero, |shutter| shutter.twist),
             readout_secs: shutter.map_or(0.0, |shutter| shutter.readout_secs),
-            time_offset_twist: keyframe.twist.map_or_else(Twist::zero, |twist| twist.of_attached(&raw_from_corrected)),
             focal_px: corrected.focal_px,
             principal_px: corrected.principal_px,
             keyframe_focal_px: keyframe.focal_px,
@@ -57,18 +53,22 @@ impl MovingCamera {
         Sighting { ray: turned.xy() / turned.z, center_m: secs * self.twist.linear_m_s }
     }
 
-    /// Motion of the camera per unit of each parameter: parameter index, meters, radians, in the camera's axes.
+    /// Motion of the camera per unit of each parameter; see [`CameraParamOffsets::motions`].
+    ///
+    /// [`CameraParamOffsets::motions`]: crate::registration::layout::CameraParamOffsets::motions
     pub(super) fn motions(&self, layout: &Layout, camera: usize) -> Vec<(usize, Vector3<f64>, Vector3<f64>)> {
-        let params = layout.of_camera(camera);
-        let mut motions = Vec::new();
-        if let Some(extrinsics) = params.extrinsics {
-            let unit = |axis: usize| Vector3::ith(axis, 1.0);
-            motions.extend((0..3).map(|axis| (extrinsics + axis, unit(axis), Vector3::zeros())));
-            motions.extend((0..3).map(|axis| (extrinsics + 3 + axis, Vector3::zeros(), unit(axis))));
-        }
-        let twist = &self.time_offset_twist;
-        motions.extend(params.time_offset.map(|time_offset| (time_offset, twist.linear_m_s, twist.angular_rad_s)));
-        motions
+        layout.of_camera(camera).motions(Some(&self.twist))
+    }
+
+    /// How much the rays of the image differ from those of the same image with other corrections: an angle, radians,
+    /// and the distance of the camera positions, meters.
+    pub(super) fn difference(&self, other: &Self) -> [f64; 2] {
+        let motion = self.world_from_camera.inverse() * other.world_from_camera;
+        let of_lens = |axis: usize| {
+            let focal = (self.focal_px[axis] / other.focal_px[axis]).ln().abs();
+            focal + (self.principal_px[axis] - other.principal_px[axis]).abs() / self.focal_px[axis]
+        };
+        [motion.rotation.angle() + of_lens(0).max(of_lens(1)), motion.translation.vector.norm()]
     }
 
     /// Motion of a corner's ray per unit of each parameter of the lens.

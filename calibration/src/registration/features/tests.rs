@@ -121,7 +121,8 @@ fn images_without_common_texture_give_no_result() {
     };
     let tiny = keyframes.iter().map(tiny).collect();
     for keyframes in [&flat, &noise, &tiny, &keyframes[..4].to_vec()] {
-        for choice in [CameraRefinement::Always(EXTRINSICS), try_extrinsics()] {
+        let all = [EXTRINSICS, ParamSet::TIME_OFFSET, ParamSet::LENS].to_vec();
+        for choice in [CameraRefinement::Always(EXTRINSICS), try_extrinsics(), CameraRefinement::Try(all)] {
             assert_eq!(crate::align(keyframes, &choice), None);
         }
     }
@@ -146,4 +147,23 @@ fn only_requested_parameters_are_estimated() {
     }
     let alignment = crate::align(&scan(&Miscalibration::none()), &CameraRefinement::Always(ParamSet::LENS)).unwrap();
     assert!(matches!(&alignment.estimates[..], [report::Estimate::Lens { .. }]), "{:?}", alignment.estimates);
+}
+
+#[test]
+fn images_without_velocity_have_no_time_offset() {
+    let still = |keyframe: &Arc<Keyframe>| Arc::new(Keyframe { twist: None, ..(**keyframe).clone() });
+    let keyframes: Vec<_> = scan(&Miscalibration::none()).iter().map(still).collect();
+    let choice = CameraRefinement::Try(vec![EXTRINSICS, ParamSet::TIME_OFFSET]);
+    let alignment = crate::align(&keyframes, &choice).unwrap();
+    assert!(alignment.trials.len() == 1 && !alignment.has_corrections(), "{:?}", alignment.trials);
+    assert_eq!(crate::align(&keyframes, &CameraRefinement::Always(ParamSet::TIME_OFFSET)), None);
+}
+
+#[test]
+fn unobservable_extrinsics_stay_in_the_report_if_other_parameters_are_tried() {
+    let miscalibration = Miscalibration { azimuth_only: true, ..Miscalibration::none() };
+    let choice = CameraRefinement::Try(vec![EXTRINSICS, ParamSet::TIME_OFFSET]);
+    let alignment = crate::align(&scan(&miscalibration), &choice).unwrap();
+    assert_eq!(alignment.trials.len(), 2);
+    assert!(alignment.unobservable.iter().any(|direction| direction.moves_cameras == ["wrist"]), "{alignment:?}");
 }
