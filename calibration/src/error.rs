@@ -25,4 +25,94 @@ pub enum Error {
         /// Number of parameters.
         n_params: usize,
     },
+    /// There is not one size per image.
+    #[error("calibration from targets: {n_images} images, but {n_sizes} image sizes")]
+    ImageSizes {
+        /// Number of images.
+        n_images: usize,
+        /// Number of sizes.
+        n_sizes: usize,
+    },
+    /// Images differ in size.
+    #[error(
+        "images have different sizes: {first} is {}x{}, {other} is {}x{}; calibrate each resolution on its own, from images of one camera",
+        first_px[0], first_px[1], other_px[0], other_px[1]
+    )]
+    MixedImageSizes {
+        /// Name of the first image.
+        first: String,
+        /// Its size, pixels.
+        first_px: [u32; 2],
+        /// Name of the first image with another size.
+        other: String,
+        /// Its size, pixels.
+        other_px: [u32; 2],
+    },
+    /// An image without pixels.
+    #[error("image {image}: its size is zero")]
+    EmptyImage {
+        /// Name of the image.
+        image: String,
+    },
+    /// A coordinate is NaN or infinite.
+    #[error("image {image}: a detected point is not finite")]
+    NonFinitePoint {
+        /// Name of the image.
+        image: String,
+    },
+    /// The points of the target are in the wrong unit.
+    #[error("the target is {size_m} m wide, expected 0.002 to 10 m; its dimensions must be in meters")]
+    TargetSize {
+        /// Longer side of the target, meters.
+        size_m: String,
+    },
+    /// The points of the target are not in one plane.
+    #[error("the target is not flat: its points differ by {depth_mm} mm in z; calibration needs a flat target")]
+    TargetNotFlat {
+        /// Range of the z coordinates, millimeters.
+        depth_mm: String,
+    },
+    /// Too few images show the target.
+    #[error(
+        "{n_images} images with a usable target, expected at least {min_images}; take 10 to 20 images with the target in all parts of the image, tilted in different directions"
+    )]
+    TooFewImages {
+        /// Number of usable images.
+        n_images: usize,
+        /// Minimum number.
+        min_images: usize,
+    },
+    /// No lens model fits the points.
+    #[error(
+        "no lens model of this kind fits the detected points; check the layout of the target and the requested model"
+    )]
+    NoLensFits,
+    /// The points of most images do not fit a flat target.
+    #[error(
+        "the detected points do not fit the target: the median error is {error_px} px; check the number of rows and columns of the target, and that it is flat"
+    )]
+    TargetMismatch {
+        /// Median error of the best lens model, pixels.
+        error_px: String,
+    },
+    /// The images do not determine the focal length.
+    #[error(
+        "the images do not determine the focal length (standard deviation {sigma_percent} %): the target is tilted by at most {max_tilt_deg} degrees; add images with the target tilted by 20 to 45 degrees to the left, right, top and bottom"
+    )]
+    FocalLengthUnobservable {
+        /// Standard deviation of the focal length, percent.
+        sigma_percent: String,
+        /// Largest angle between the target and the image plane, degrees.
+        max_tilt_deg: String,
+    },
+    /// The images do not determine the principal point.
+    #[error(
+        "the images do not determine the principal point (standard deviation {sigma_px} px): the target is tilted by at most {max_tilt_deg} degrees; add images with the target tilted by 20 to 45 degrees in different directions"
+    )]
+    PrincipalPointUnobservable {
+        /// Standard deviation of the principal point, pixels.
+        sigma_px: String,
+        /// Largest angle between the target and the image plane, degrees.
+        max_tilt_deg: String,
+    },
 }

@@ -7,6 +7,9 @@
 //! [`AlignmentTask`] runs [`align`] in parallel with training. [`register_station`] estimates the pose of a mobile base
 //! at one station.
 //!
+//! [`calibrate_intrinsics`] estimates focal length, principal point and lens of one camera from images of a flat
+//! calibration target.
+//!
 //! ```
 //! use calibration::CameraCorrection;
 //! # use keyframe::{Keyframe, Split};
@@ -26,6 +29,7 @@ mod background;
 mod board;
 mod correction;
 mod error;
+mod intrinsics;
 pub mod least_squares;
 mod params;
 mod registration;
@@ -39,6 +43,10 @@ pub use correction::{
     CalibratedCamera, CameraCorrection, EMBEDDING_DIM, drift_weight, interpolate, rigid_transform, shares_lens,
 };
 pub use error::Error;
+pub use intrinsics::{
+    BoardPose, EstimatedParam, ImageFit, ImageGrid, IntrinsicsCalibration, IntrinsicsInput, LensModel, LensTrial,
+    NextView, PointFit, Rejected, RejectionReason, board_pose, calibrate_intrinsics,
+};
 pub use params::ParamSet;
 pub use registration::{
     Alignment, CameraMovement, Estimate, MOVEMENT_WINDOW, MovementDetector, PoseEstimate, ScalarEstimate,

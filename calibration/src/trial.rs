@@ -102,6 +102,23 @@ impl std::fmt::Display for Candidate {
     }
 }
 
+/// Mean of paired gains.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct MeanGain {
+    pub(crate) mean: f64,
+    /// Standard error of the mean.
+    pub(crate) standard_error: f64,
+}
+
+impl MeanGain {
+    pub(crate) fn of(gains: &[f64]) -> Self {
+        let n = gains.len().max(1) as f64;
+        let mean = gains.iter().sum::<f64>() / n;
+        let variance = gains.iter().map(|gain| (gain - mean).powi(2)).sum::<f64>() / f64::max(n - 1.0, 1.0);
+        Self { mean, standard_error: (variance / n).sqrt() }
+    }
+}
+
 /// Result of a trial.
 ///
 /// ```
@@ -134,10 +151,7 @@ impl Trial {
 
     /// Evaluates the gains of single images, dB.
     pub fn of_gains(candidate: Candidate, gains_db: &[f64]) -> Self {
-        let n = gains_db.len().max(1) as f64;
-        let gain_db = gains_db.iter().sum::<f64>() / n;
-        let variance = gains_db.iter().map(|gain| (gain - gain_db).powi(2)).sum::<f64>() / f64::max(n - 1.0, 1.0);
-        let standard_error_db = (variance / n).sqrt();
+        let MeanGain { mean: gain_db, standard_error: standard_error_db } = MeanGain::of(gains_db);
         let (n_images, min_db) = (gains_db.len(), candidate.min_gain_db());
         // In case of doubt, neither additions nor reductions are accepted.
         let is_significant = match candidate {

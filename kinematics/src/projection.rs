@@ -118,7 +118,7 @@ mod tests {
                 for (ix, column) in projection.by_intrinsics.column_iter().enumerate() {
                     let at = |nudge: f64| {
                         let mut params = params.clone();
-                        params.get_mut(ix).map(|value| *value += nudge);
+                        params.iter_mut().skip(ix).take(1).for_each(|value| *value += nudge);
                         Vector2::from(camera.with_params(&params).project(&point).unwrap())
                     };
                     let numeric = (at(NUDGE) - at(-NUDGE)) / (2.0 * NUDGE);

@@ -16,6 +16,9 @@ pub struct Fit<S> {
     pub n_params: usize,
     /// Variance of a scalar residual, estimated from the residuals.
     pub variance: f64,
+    /// How much larger the scatter of the blocks' gradients is than independent residuals explain. Above 1, residuals of
+    /// a block share errors, and the covariance times this factor is more honest.
+    pub dispersion: f64,
     /// Information about the shared parameters with free local parameters, for residuals of unit variance.
     pub information: DMatrix<f64>,
     /// Covariance of the shared parameters. Entries of unobservable parameters are very large, but finite.
@@ -58,7 +61,12 @@ pub(super) fn fit<S>(
     let information = normal_equations::information(&at.blocks, scales.len());
     let (variance, covariance_factor) = variances(&at, n_params, options.min_noise);
     let scaled = DMatrix::from_diagonal(scales) * &information * DMatrix::from_diagonal(scales);
-    let eigen = SymmetricEigen::new(scaled);
+    // An empty matrix has no decomposition.
+    let eigen = if scales.is_empty() {
+        SymmetricEigen { eigenvectors: scaled, eigenvalues: DVector::zeros(0) }
+    } else {
+        SymmetricEigen::new(scaled)
+    };
     let floor = (ROUNDING * eigen.eigenvalues.iter().copied().fold(0.0, f64::max)).max(f64::MIN_POSITIVE / ROUNDING);
     let mut directions: Vec<Direction> = eigen
         .eigenvalues
@@ -81,6 +89,7 @@ pub(super) fn fit<S>(
         n_residuals: at.totals.n_scalars,
         n_params,
         variance,
+        dispersion: normal_equations::dispersion(&at.blocks, scales.len(), variance),
         information,
         covariance,
         directions,

@@ -51,6 +51,8 @@ pub struct Options {
     pub loss: Loss,
     /// Maximum number of steps, including rejected ones.
     pub max_steps: usize,
+    /// The minimization ends if a step is predicted to decrease the cost by less than this fraction.
+    pub tolerance: f64,
     /// Lower limit of the residuals' standard deviation, in units of the residuals. It limits the stated accuracy where
     /// the residuals are smaller than any measurement could be, and decides when steps are too small to matter.
     pub min_noise: f64,
@@ -58,7 +60,7 @@ pub struct Options {
 
 impl Default for Options {
     fn default() -> Self {
-        Self { loss: Loss::Squared, max_steps: 100, min_noise: 1e-9 }
+        Self { loss: Loss::Squared, max_steps: 100, tolerance: 1e-12, min_noise: 1e-9 }
     }
 }
 
@@ -67,8 +69,6 @@ impl Default for Options {
 /// # Errors
 /// If a residual is not defined at the initial state, or if there are not more residuals than parameters.
 pub fn minimize<P: Problem>(problem: &P, initial: P::State, options: &Options) -> Result<Fit<P::State>, Error> {
-    /// A step whose predicted decrease is below this fraction of the cost does not matter.
-    const CONVERGED: f64 = 1e-12;
     const INITIAL_DAMPING: f64 = 1e-4;
     const MIN_DAMPING: f64 = 1e-15;
     const MAX_DAMPING: f64 = 1e12;
@@ -86,7 +86,7 @@ pub fn minimize<P: Problem>(problem: &P, initial: P::State, options: &Options) -
     while n_steps < options.max_steps && !converged && damping < MAX_DAMPING {
         n_steps += 1;
         let trial = normal_equations::step(&at.blocks, n_shared, damping).and_then(|step| {
-            converged = step.predicted <= CONVERGED * 0.5 * (at.totals.loss + noise_floor);
+            converged = step.predicted <= options.tolerance * 0.5 * (at.totals.loss + noise_floor);
             let state = problem.moved(&at.state, &step.shared, &step.local);
             let trial = Evaluation::new(problem, state, options.loss).ok()?;
             let gain = 0.5 * (at.totals.loss - trial.totals.loss) / step.predicted;
@@ -133,7 +133,7 @@ impl<S: Clone> Evaluation<S> {
                 return Err(block_ix);
             }
             totals.add(&sums.totals);
-            blocks.push(sums);
+            blocks.push(sums.summed());
         }
         Ok(Self { state, blocks, totals })
     }

@@ -1,0 +1,109 @@
+//! Checks of the points before a calibration, and of the observability after it.
+
+use super::bundle::Bundle;
+use super::report::{Rejected, RejectionReason};
+use super::robust::MIN_POINTS;
+use crate::least_squares::Fit;
+use crate::{BoardPoint, BoardView, Error};
+use nalgebra::Vector3;
+
+/// Minimum number of images: each gives two constraints on focal lengths and principal point.
+pub(super) const MIN_IMAGES: usize = 3;
+
+/// Returns the indices of the images with enough points, and rejects the others.
+///
+/// # Errors
+/// If the sizes differ, a value is not finite, the target is not flat or has an implausible size, or there are too few
+/// images.
+pub(super) fn usable_images(views: &[BoardView], sizes_px: &[[u32; 2]]) -> Result<(Vec<usize>, Vec<Rejected>), Error> {
+    if sizes_px.len() != views.len() {
+        return Err(Error::ImageSizes { n_images: views.len(), n_sizes: sizes_px.len() });
+    }
+    for (view, size_px) in views.iter().zip(sizes_px) {
+        if *size_px != sizes_px[0] {
+            let (first, first_px) = (views[0].name.clone(), sizes_px[0]);
+            return Err(Error::MixedImageSizes { first, first_px, other: view.name.clone(), other_px: *size_px });
+        }
+        if size_px.contains(&0) {
+            return Err(Error::EmptyImage { image: view.name.clone() });
+        }
+        let is_finite =
+            |point: &BoardPoint| point.pixel.iter().chain(point.point_in_board.iter()).all(|value| value.is_finite());
+        if !view.points.iter().all(is_finite) {
+            return Err(Error::NonFinitePoint { image: view.name.clone() });
+        }
+    }
+    check_target(views.iter().flat_map(|view| &view.points))?;
+    let (mut usable, mut rejected) = (Vec::new(), Vec::new());
+    for (ix, view) in views.iter().enumerate() {
+        let n_points = view.points.len();
+        if n_points >= MIN_POINTS {
+            usable.push(ix);
+        } else {
+            let reason = RejectionReason::TooFewPoints { n_points, min_points: MIN_POINTS };
+            rejected.push(Rejected { image: view.name.clone(), reason });
+        }
+    }
+    check_n_images(usable.len())?;
+    Ok((usable, rejected))
+}
+
+pub(super) fn check_n_images(n_images: usize) -> Result<(), Error> {
+    if n_images < MIN_IMAGES { Err(Error::TooFewImages { n_images, min_images: MIN_IMAGES }) } else { Ok(()) }
+}
+
+fn check_target<'a>(points: impl Iterator<Item = &'a BoardPoint> + Clone) -> Result<(), Error> {
+    const SIZES_M: std::ops::RangeInclusive<f64> = 0.002..=10.0;
+    /// Allowed deviation from a plane, relative to the size of the target.
+    const MAX_BEND: f64 = 0.02;
+    let infinite = Vector3::repeat(f64::INFINITY);
+    let (low, high) = points.fold((infinite, -infinite), |(low, high), point| {
+        (low.inf(&point.point_in_board), high.sup(&point.point_in_board))
+    });
+    let extent = high - low;
+    let size_m = extent.x.max(extent.y);
+    if size_m < 0.0 {
+        return Ok(()); // No points: reported as too few images.
+    }
+    if !SIZES_M.contains(&size_m) {
+        return Err(Error::TargetSize { size_m: size_m.to_string() });
+    }
+    if extent.z > MAX_BEND * size_m {
+        return Err(Error::TargetNotFlat { depth_mm: format!("{:.1}", 1e3 * extent.z) });
+    }
+    Ok(())
+}
+
+/// Refuses a result whose focal length or principal point the images do not determine.
+pub(super) fn check_observable(fit: &Fit<Bundle>) -> Result<(), Error> {
+    /// Maximum standard deviation of the focal length, relative to it, and of the principal point, relative to the
+    /// focal length or to the longer side of the image.
+    const MAX_SIGMA_FRAC: f64 = 0.05;
+    /// Focal lengths, relative to the longer side of the image, that occur in cameras.
+    const FOCAL_FRACS: std::ops::Range<f64> = 0.05..100.0;
+    let intrinsics = &fit.state.intrinsics;
+    let side_px = f64::from(intrinsics.size_px[0].max(intrinsics.size_px[1]));
+    let max_tilt_deg = fit.state.poses.iter().map(|pose| {
+        let normal = pose.rotation * Vector3::z();
+        normal.z.abs().min(1.0).acos().to_degrees()
+    });
+    let max_tilt_deg = max_tilt_deg.fold(0.0, f64::max);
+    for (axis, focal_px) in intrinsics.focal_px.into_iter().enumerate() {
+        let sigma_frac = fit.sigma(axis) / focal_px.abs();
+        if !(sigma_frac < MAX_SIGMA_FRAC && FOCAL_FRACS.contains(&(focal_px / side_px))) {
+            return Err(Error::FocalLengthUnobservable {
+                sigma_percent: format!("{:.0}", 100.0 * sigma_frac.min(10.0)),
+                max_tilt_deg: format!("{max_tilt_deg:.0}"),
+            });
+        }
+        let sigma_px = fit.sigma(2 + axis);
+        // A shift of the principal point of a long lens is almost a rotation of the camera.
+        if sigma_px.is_nan() || sigma_px >= MAX_SIGMA_FRAC * side_px.max(focal_px) {
+            return Err(Error::PrincipalPointUnobservable {
+                sigma_px: format!("{:.0}", sigma_px.min(side_px)),
+                max_tilt_deg: format!("{max_tilt_deg:.0}"),
+            });
+        }
+    }
+    Ok(())
+}

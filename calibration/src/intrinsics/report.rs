@@ -1,0 +1,240 @@
+//! Results of a calibration of intrinsics.
+
+use super::board_pose::board_pose;
+use super::bundle::Bundle;
+use super::coefficients::Family;
+use super::grid::{self, ImageGrid, ProjectionDerivatives};
+use super::next_view::{self, NextView};
+use super::robust::RobustFit;
+use super::selection::LensTrial;
+use crate::BoardView;
+use kinematics::quantile::median;
+use kinematics::{Intrinsics, Lens, Transform};
+use nalgebra::DMatrix;
+
+/// Result of [`super::calibrate_intrinsics`].
+#[derive(Clone, Debug)]
+pub struct IntrinsicsCalibration {
+    /// The intrinsics. A pinhole if no coefficient was estimated.
+    pub intrinsics: Intrinsics,
+    /// The lens model and the coefficients that were estimated, such as `brown_conrady k1 k2`.
+    pub model: String,
+    /// The estimated parameters: focal lengths, principal point, and coefficients.
+    pub params: Vec<EstimatedParam>,
+    /// Covariance of [`Self::params`].
+    pub covariance: DMatrix<f64>,
+    /// Root mean square of the distances between detected and projected points, pixels; over the points in use, as in
+    /// OpenCV.
+    pub rms_px: f64,
+    /// Standard deviation of a detected corner along one axis, estimated from the residuals, pixels.
+    pub noise_px: f64,
+    /// How much larger the scatter between images is than independent errors of the corners explain; 1 if they are
+    /// independent. The covariance contains this factor if it is above 1.
+    pub dispersion: f64,
+    /// The images in use.
+    pub images: Vec<ImageFit>,
+    /// Images and corners that were not used, with the reason.
+    pub rejected: Vec<Rejected>,
+    /// Comparisons of lens models; empty unless the model is [`super::LensModel::Auto`].
+    pub trials: Vec<LensTrial>,
+    /// Number of corners in use in each part of the image.
+    pub coverage: ImageGrid<usize>,
+    /// Standard deviation of the projection of a distant point in each part of the image, in the worst direction,
+    /// pixels. `None` beyond the range of the lens model.
+    ///
+    /// The uncertainty of the intrinsics is propagated to the pixel after the rotation of the camera frame that absorbs
+    /// most of each change, because such a rotation does not matter for images of unknown pose. mrcal 2.4 ("projection
+    /// uncertainty") derives this rotation from the poses of the target; here it minimizes the squared displacements
+    /// over the whole image.
+    pub uncertainty_px: ImageGrid<Option<f64>>,
+    /// The pose of the target that would lower the projection uncertainty the most.
+    pub next_view: Option<NextView>,
+}
+
+/// An estimated parameter.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct EstimatedParam {
+    /// `fx`, `fy`, `cx`, `cy` (pixels), or OpenCV's name of a coefficient.
+    pub name: &'static str,
+    /// The estimate.
+    pub value: f64,
+    /// Its standard deviation.
+    pub sigma: f64,
+}
+
+/// An image that was used.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ImageFit {
+    /// Name of the view.
+    pub name: String,
+    /// Root mean square of the distances between detected and projected points in use, pixels.
+    pub rms_px: f64,
+    /// Pose of the target in the camera frame.
+    pub camera_from_board: Transform,
+    /// The points in use.
+    pub points: Vec<PointFit>,
+}
+
+/// A point that was used.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct PointFit {
+    /// Detected position, pixels.
+    pub pixel: [f64; 2],
+    /// Detected minus projected position, pixels.
+    pub residual_px: [f64; 2],
+}
+
+/// An image or some of its corners that were not used.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Rejected {
+    /// Name of the view.
+    pub image: String,
+    /// The reason.
+    pub reason: RejectionReason,
+}
+
+impl std::fmt::Display for Rejected {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "{}: {}", self.image, self.reason)
+    }
+}
+
+/// Why an image or some of its corners were not used.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum RejectionReason {
+    /// The image has too few points for a pose.
+    TooFewPoints {
+        /// Number of points.
+        n_points: usize,
+        /// Minimum number.
+        min_points: usize,
+    },
+    /// No pose of the target explains the points.
+    Inconsistent {
+        /// Median error of this image, pixels.
+        median_px: f64,
+        /// Median error of a typical image, pixels.
+        typical_px: f64,
+    },
+    /// Single corners are inconsistent with the others. The rest of the image is used.
+    Corners {
+        /// Number of rejected corners.
+        n_corners: usize,
+        /// Largest error among them, pixels.
+        max_px: f64,
+        /// Median error of a typical image, pixels.
+        typical_px: f64,
+    },
+}
+
+impl std::fmt::Display for RejectionReason {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::TooFewPoints { n_points, min_points } => {
+                write!(f, "{n_points} points, expected at least {min_points}")
+            }
+            Self::Inconsistent { median_px, typical_px } => write!(
+                f,
+                "median error {median_px:.2} px, {typical_px:.2} px in a typical image: the target was detected wrongly, \
+                 or its layout differs"
+            ),
+            Self::Corners { n_corners, max_px, typical_px } => write!(
+                f,
+                "{n_corners} corners off by up to {max_px:.2} px, {typical_px:.2} px in a typical image; its other \
+                 corners are used"
+            ),
+        }
+    }
+}
+
+/// The images and corners that a fit does not use.
+pub(super) fn rejections(views: &[&BoardView], fit: &RobustFit) -> Vec<Rejected> {
+    let (kept, intrinsics) = (&fit.kept, &fit.fit.state.intrinsics);
+    let typical_px = fit.typical_px;
+    let reason = |(image_ix, view): (usize, &&BoardView)| {
+        let position = kept.image_ixs.iter().position(|kept_ix| *kept_ix == image_ix);
+        let pose = match position {
+            Some(position) => Some(fit.fit.state.poses[position]),
+            None => board_pose(intrinsics, &view.points).map(|pose| pose.camera_from_board),
+        };
+        let errors_px = pose.map_or(vec![f64::INFINITY], |pose| {
+            let single = Bundle { intrinsics: intrinsics.clone(), poses: vec![pose] };
+            single.errors_px(0, &view.points)
+        });
+        let Some(position) = position else {
+            let median_px = median(&errors_px).unwrap_or(f64::INFINITY);
+            return Some(RejectionReason::Inconsistent { median_px, typical_px });
+        };
+        let n_corners = view.points.len() - kept.points[position].len();
+        let max_px = errors_px.iter().copied().fold(0.0, f64::max);
+        (n_corners > 0).then_some(RejectionReason::Corners { n_corners, max_px, typical_px })
+    };
+    let rejected =
+        |(ix, view): (usize, &&BoardView)| Some(Rejected { image: view.name.clone(), reason: reason((ix, view))? });
+    views.iter().enumerate().filter_map(rejected).collect()
+}
+
+/// Summarizes a fit.
+pub(super) fn report(
+    views: &[&BoardView],
+    RobustFit { fit, coefficients, kept, .. }: RobustFit,
+    rejected: Vec<Rejected>,
+    trials: Vec<LensTrial>,
+) -> IntrinsicsCalibration {
+    let params = coefficients.params();
+    let values = fit.state.intrinsics.params();
+    let estimated = coefficients.names().into_iter().zip(&params).enumerate();
+    let estimated =
+        estimated.map(|(ix, (name, param))| EstimatedParam { name, value: values[*param], sigma: fit.sigma(ix) });
+    let images: Vec<ImageFit> = kept
+        .image_ixs
+        .iter()
+        .enumerate()
+        .map(|(ix, view_ix)| {
+            let points = &kept.points[ix];
+            let residuals = fit.state.residuals(ix, points).into_iter().flatten();
+            let points = points.iter().zip(residuals);
+            let points = points.map(|(point, residual)| PointFit { pixel: point.pixel, residual_px: residual.into() });
+            let points: Vec<PointFit> = points.collect();
+            ImageFit {
+                name: views[*view_ix].name.clone(),
+                rms_px: rms_px(points.iter()),
+                camera_from_board: fit.state.poses[ix],
+                points,
+            }
+        })
+        .collect();
+    let derivatives = ProjectionDerivatives::new(&fit.state.intrinsics, &params);
+    let known = next_view::Known {
+        intrinsics: &fit.state.intrinsics,
+        params: &params,
+        information: &fit.information,
+        variance: fit.variance * fit.dispersion.max(1.0),
+    };
+    let is_pinhole = coefficients.family == Family::BrownConrady && params.len() == 4;
+    let points = || images.iter().flat_map(|image| &image.points);
+    IntrinsicsCalibration {
+        model: coefficients.to_string(),
+        params: estimated.collect(),
+        rms_px: rms_px(points()),
+        noise_px: fit.variance.sqrt(),
+        dispersion: fit.dispersion,
+        rejected,
+        trials,
+        coverage: grid::coverage(fit.state.intrinsics.size_px, points().map(|point| point.pixel)),
+        uncertainty_px: derivatives.sigmas_px(&fit.covariance),
+        next_view: next_view::suggest(&known, &derivatives, &kept.images()),
+        intrinsics: Intrinsics {
+            lens: if is_pinhole { Lens::Pinhole } else { fit.state.intrinsics.lens },
+            ..fit.state.intrinsics
+        },
+        covariance: fit.covariance,
+        images,
+    }
+}
+
+/// Root mean square of the norms of the residuals.
+fn rms_px<'a>(points: impl Iterator<Item = &'a PointFit> + Clone) -> f64 {
+    let squares: f64 = points.clone().map(|PointFit { residual_px: [x, y], .. }| x * x + y * y).sum();
+    (squares / points.count().max(1) as f64).sqrt()
+}
