@@ -44,6 +44,40 @@ pub enum Lens {
     /// Fisheye: coefficients k1, k2, k3, k4 of the equidistant polynomial (Kannala and Brandt 2006, as in OpenCV's
     /// fisheye model).
     KannalaBrandt([f64; 4]),
+    /// Brown-Conrady with a rational radial part, in the order of OpenCV's rational model: k1, k2, p1, p2, k3, k4, k5,
+    /// k6. The radial factor is `(1 + k1 r2 + k2 r4 + k3 r6) / (1 + k4 r2 + k5 r4 + k6 r6)`.
+    RationalBrownConrady([f64; 8]),
+}
+
+impl Lens {
+    /// The distortion coefficients; none for a pinhole.
+    pub fn coefficients(&self) -> &[f64] {
+        match self {
+            Self::Pinhole => &[],
+            Self::BrownConrady(k) => k,
+            Self::KannalaBrandt(k) => k,
+            Self::RationalBrownConrady(k) => k,
+        }
+    }
+
+    /// The distorted position of a point of the plane `z = 1`. `None` outside the range of the lens.
+    pub(crate) fn distort(&self, plane: Vector2<f64>) -> Option<lens::Distorted> {
+        match self {
+            Self::Pinhole => Some(lens::Distorted::none(plane)),
+            Self::BrownConrady(k) => lens::brown_conrady(k, plane),
+            Self::KannalaBrandt(k) => lens::kannala_brandt(k, plane),
+            Self::RationalBrownConrady(k) => lens::rational(k, plane),
+        }
+    }
+
+    fn undistort(&self, distorted: Vector2<f64>) -> Option<Vector2<f64>> {
+        match self {
+            Self::Pinhole => Some(distorted),
+            Self::BrownConrady(k) => lens::undistort_brown_conrady(k, distorted),
+            Self::KannalaBrandt(k) => lens::undistort_kannala_brandt(k, distorted),
+            Self::RationalBrownConrady(k) => lens::undistort_rational(k, distorted),
+        }
+    }
 }
 
 impl Intrinsics {
@@ -56,12 +90,7 @@ impl Intrinsics {
             return None;
         }
         let plane = point_in_camera.xy() / point_in_camera.z;
-        let distorted = match self.lens_in_use() {
-            Lens::Pinhole => plane,
-            Lens::BrownConrady(k) => lens::brown_conrady(&k, plane)?.value,
-            Lens::KannalaBrandt(k) => lens::kannala_brandt(&k, plane)?.value,
-        };
-        self.pixel_at(distorted)
+        self.pixel_at(self.lens_in_use().distort(plane)?.value)
     }
 
     /// Like [`Intrinsics::project`], and also returns the derivative of the pixel with respect to the point, pixels
@@ -72,11 +101,7 @@ impl Intrinsics {
             return None;
         }
         let plane = Vector2::new(x / z, y / z);
-        let distorted = match self.lens_in_use() {
-            Lens::Pinhole => lens::Distorted::none(plane),
-            Lens::BrownConrady(k) => lens::brown_conrady(&k, plane)?,
-            Lens::KannalaBrandt(k) => lens::kannala_brandt(&k, plane)?,
-        };
+        let distorted = self.lens_in_use().distort(plane)?;
         let plane_by_point = Matrix2x3::new(1.0, 0.0, -plane.x, 0.0, 1.0, -plane.y) / z;
         let mut pixel_by_point = distorted.jacobian * plane_by_point;
         pixel_by_point.row_mut(0).scale_mut(self.focal_px[0]);
@@ -96,11 +121,7 @@ impl Intrinsics {
         if !distorted.iter().all(|value| value.is_finite()) {
             return None;
         }
-        let plane = match self.lens_in_use() {
-            Lens::Pinhole => distorted,
-            Lens::BrownConrady(k) => lens::undistort_brown_conrady(&k, distorted)?,
-            Lens::KannalaBrandt(k) => lens::undistort_kannala_brandt(&k, distorted)?,
-        };
+        let plane = self.lens_in_use().undistort(distorted)?;
         Some(Vector3::new(plane.x, plane.y, 1.0))
     }
 
@@ -136,6 +157,7 @@ impl Intrinsics {
         match self.lens_in_use() {
             Lens::Pinhole => true,
             Lens::BrownConrady(k) => k == [0.0; 5],
+            Lens::RationalBrownConrady(k) => k == [0.0; 8],
             Lens::KannalaBrandt(_) => false, // The projection is equidistant even if all coefficients are zero.
         }
     }
@@ -159,19 +181,15 @@ impl Intrinsics {
             check(focal_name, focal, focal.is_finite() && focal > 0.0, "a positive number of pixels")?;
             check(principal_name, principal, principal.is_finite(), "a finite number of pixels")?;
         }
-        let coefficients: &[f64] = match &self.lens {
-            Lens::Pinhole => &[],
-            Lens::BrownConrady(k) => k,
-            Lens::KannalaBrandt(k) => k,
-        };
-        coefficients.iter().try_for_each(|&k| check("a distortion coefficient", k, k.is_finite(), "a finite number"))
+        let is_finite = |&k: &f64| check("a distortion coefficient", k, k.is_finite(), "a finite number");
+        self.lens.coefficients().iter().try_for_each(is_finite)
     }
 
-    fn lens_in_use(&self) -> Lens {
+    pub(crate) fn lens_in_use(&self) -> Lens {
         if self.rectified { Lens::Pinhole } else { self.lens }
     }
 
-    fn pixel_at(&self, distorted: Vector2<f64>) -> Option<[f64; 2]> {
+    pub(crate) fn pixel_at(&self, distorted: Vector2<f64>) -> Option<[f64; 2]> {
         let pixel = [0, 1].map(|axis| self.focal_px[axis] * distorted[axis] + self.principal_px[axis]);
         (pixel[0].is_finite() && pixel[1].is_finite()).then_some(pixel)
     }
@@ -201,6 +219,7 @@ mod tests {
             Lens::BrownConrady([0.12, -0.31, 0.002, 0.001, 0.19]),
             Lens::KannalaBrandt([0.0; 4]),
             Lens::KannalaBrandt([-0.01, 0.02, -0.015, 0.003]),
+            Lens::RationalBrownConrady([0.4, -0.1, 0.001, -0.0005, 0.01, 0.7, -0.02, 0.03]),
         ]
     }
 

@@ -1,5 +1,6 @@
 //! Distortion of the plane `z = 1` by a lens, its derivative and its inverse.
 
+use crate::polynomial::{CONVERGED, evaluate, positive_on, solve_rising};
 use nalgebra::{Matrix2, Vector2};
 
 /// A distorted point of the plane `z = 1` and its derivative with respect to the undistorted point.
@@ -14,69 +15,162 @@ impl Distorted {
     }
 }
 
-/// Newton's method stops when the step is below this fraction of the value, just above rounding errors.
-const CONVERGED: f64 = 1e-15;
+/// Radial part of Brown-Conrady distortion: the factor `numerator(r2) / denominator(r2)` of the radius `r`.
+trait Radial {
+    /// The factor and its derivative with respect to `r2`.
+    fn factor(&self, r2: f64) -> (f64, f64);
+    /// Whether `r` times the factor is finite and rises from 0 to the radius with this square.
+    fn is_rising_to(&self, r2: f64) -> bool;
+}
+
+/// `1 + k1 r2 + k2 r4 + k3 r6`.
+struct PolynomialRadial([f64; 3]);
+
+impl Radial for PolynomialRadial {
+    fn factor(&self, r2: f64) -> (f64, f64) {
+        let [k1, k2, k3] = self.0;
+        (1.0 + r2 * (k1 + r2 * (k2 + r2 * k3)), k1 + r2 * (2.0 * k2 + r2 * 3.0 * k3))
+    }
+
+    fn is_rising_to(&self, r2: f64) -> bool {
+        let [k1, k2, k3] = self.0;
+        positive_on(&[1.0, 3.0 * k1, 5.0 * k2, 7.0 * k3], r2)
+    }
+}
+
+/// `(1 + k1 r2 + k2 r4 + k3 r6) / (1 + k4 r2 + k5 r4 + k6 r6)`.
+struct RationalRadial {
+    numerator: [f64; 4],
+    denominator: [f64; 4],
+}
+
+impl Radial for RationalRadial {
+    fn factor(&self, r2: f64) -> (f64, f64) {
+        let (numerator, denominator) = (evaluate(&self.numerator, r2), evaluate(&self.denominator, r2));
+        let by_r2 = evaluate(&derivative(&self.numerator), r2) * denominator
+            - numerator * evaluate(&derivative(&self.denominator), r2);
+        (numerator / denominator, by_r2 / (denominator * denominator))
+    }
+
+    /// With numerator N and denominator D, the derivative of `r N / D` is `(N D + 2 r2 (N' D - N D')) / D²`.
+    fn is_rising_to(&self, r2: f64) -> bool {
+        let mut rise = [0.0; 7];
+        for (i, n) in self.numerator.iter().enumerate() {
+            for (j, d) in self.denominator.iter().enumerate() {
+                rise[i + j] += n * d * (1.0 + 2.0 * (i as f64 - j as f64));
+            }
+        }
+        positive_on(&self.denominator, r2) && positive_on(&rise, r2)
+    }
+}
+
+fn derivative(&[_, a, b, c]: &[f64; 4]) -> [f64; 3] {
+    [a, 2.0 * b, 3.0 * c]
+}
 
 /// Applies Brown-Conrady distortion (Brown 1966, Conrady 1919) in OpenCV's form. `None` beyond the radius up to which
 /// the radial part is monotonic.
 pub(crate) fn brown_conrady(k: &[f64; 5], plane: Vector2<f64>) -> Option<Distorted> {
-    let distorted = brown_conrady_unchecked(k, plane);
-    let monotonic = positive_on(&radial_derivative(k), plane.norm_squared()) && distorted.jacobian.determinant() > 0.0;
-    monotonic.then_some(distorted)
-}
-
-fn brown_conrady_unchecked(&[k1, k2, p1, p2, k3]: &[f64; 5], plane: Vector2<f64>) -> Distorted {
-    let (x, y) = (plane.x, plane.y);
-    let r2 = plane.norm_squared();
-    let radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3));
-    let radial_by_r2 = k1 + r2 * (2.0 * k2 + r2 * 3.0 * k3);
-    let value = Vector2::new(
-        x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
-        y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
-    );
-    let across = 2.0 * (x * y * radial_by_r2 + p1 * x + p2 * y);
-    let jacobian = Matrix2::new(
-        radial + 2.0 * (x * x * radial_by_r2 + p1 * y + 3.0 * p2 * x),
-        across,
-        across,
-        radial + 2.0 * (y * y * radial_by_r2 + 3.0 * p1 * y + p2 * x),
-    );
-    Distorted { value, jacobian }
-}
-
-/// Derivative of `r (1 + k1 r2 + k2 r4 + k3 r6)` with respect to r, as a polynomial in r2.
-fn radial_derivative(&[k1, k2, _, _, k3]: &[f64; 5]) -> [f64; 5] {
-    [1.0, 3.0 * k1, 5.0 * k2, 7.0 * k3, 0.0]
+    distort(&PolynomialRadial([k[0], k[1], k[4]]), [k[2], k[3]], plane)
 }
 
 /// The point that [`brown_conrady`] maps to `distorted`.
 pub(crate) fn undistort_brown_conrady(k: &[f64; 5], distorted: Vector2<f64>) -> Option<Vector2<f64>> {
+    undistort(&PolynomialRadial([k[0], k[1], k[4]]), [k[2], k[3]], distorted)
+}
+
+/// Applies Brown-Conrady distortion with a rational radial part, OpenCV's rational model (Claus and Fitzgibbon 2005).
+/// `None` beyond the radius up to which the radial part is monotonic.
+pub(crate) fn rational(k: &[f64; 8], plane: Vector2<f64>) -> Option<Distorted> {
+    distort(&rational_radial(k), [k[2], k[3]], plane)
+}
+
+/// The point that [`rational`] maps to `distorted`.
+pub(crate) fn undistort_rational(k: &[f64; 8], distorted: Vector2<f64>) -> Option<Vector2<f64>> {
+    undistort(&rational_radial(k), [k[2], k[3]], distorted)
+}
+
+fn rational_radial(&[k1, k2, _, _, k3, k4, k5, k6]: &[f64; 8]) -> RationalRadial {
+    RationalRadial { numerator: [1.0, k1, k2, k3], denominator: [1.0, k4, k5, k6] }
+}
+
+fn distort(radial: &impl Radial, tangential: [f64; 2], plane: Vector2<f64>) -> Option<Distorted> {
+    let distorted = distort_unchecked(radial, tangential, plane);
+    let monotonic = radial.is_rising_to(plane.norm_squared()) && distorted.jacobian.determinant() > 0.0;
+    monotonic.then_some(distorted)
+}
+
+fn distort_unchecked(radial: &impl Radial, [p1, p2]: [f64; 2], plane: Vector2<f64>) -> Distorted {
+    let (x, y) = (plane.x, plane.y);
+    let r2 = plane.norm_squared();
+    let (factor, factor_by_r2) = radial.factor(r2);
+    let value = Vector2::new(
+        x * factor + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
+        y * factor + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
+    );
+    let across = 2.0 * (x * y * factor_by_r2 + p1 * x + p2 * y);
+    let jacobian = Matrix2::new(
+        factor + 2.0 * (x * x * factor_by_r2 + p1 * y + 3.0 * p2 * x),
+        across,
+        across,
+        factor + 2.0 * (y * y * factor_by_r2 + 3.0 * p1 * y + p2 * x),
+    );
+    Distorted { value, jacobian }
+}
+
+fn undistort(radial: &impl Radial, tangential: [f64; 2], distorted: Vector2<f64>) -> Option<Vector2<f64>> {
     const MAX_STEPS: usize = 50;
     let length = distorted.norm();
-    if length == 0.0 && k[2] == 0.0 && k[3] == 0.0 {
+    if length == 0.0 && tangential == [0.0; 2] {
         return Some(distorted);
     }
     // Without the tangential part, solving for the radius suffices. With it, that solution is the initial value of
     // Newton's method in the plane.
-    let radial = [1.0, k[0], k[1], k[4], 0.0];
-    let mut plane = match solve_odd_polynomial(&radial, &radial_derivative(k), length, f64::INFINITY) {
+    let distorted_radius = |radius: f64| {
+        let r2 = radius * radius;
+        let (factor, factor_by_r2) = radial.factor(r2);
+        (radius * factor, factor + 2.0 * r2 * factor_by_r2)
+    };
+    let is_rising_to = |radius: f64| radial.is_rising_to(radius * radius);
+    let mut plane = match solve_rising(distorted_radius, is_rising_to, length, f64::INFINITY) {
         Some(radius) if length > 0.0 => distorted * (radius / length),
         Some(_) => distorted,
         // Just outside the radial limit, the tangential part may still move the point inside.
-        None if k[2] != 0.0 || k[3] != 0.0 => distorted,
+        None if tangential != [0.0; 2] => distorted,
         None => return None,
     };
     for _ in 0..MAX_STEPS {
-        let guess = brown_conrady_unchecked(k, plane);
+        let guess = distort_unchecked(radial, tangential, plane);
         let step = guess.jacobian.try_inverse()? * (guess.value - distorted);
         plane -= step;
         if step.norm() <= CONVERGED * (1.0 + plane.norm()) {
             break;
         }
     }
-    let check = brown_conrady(k, plane)?;
+    let check = distort(radial, tangential, plane)?;
     const CLOSE: f64 = 1e-12;
     ((check.value - distorted).norm() <= CLOSE * (1.0 + length)).then_some(plane)
+}
+
+/// Derivatives of [`brown_conrady`] with respect to its coefficients.
+pub(crate) fn brown_conrady_by_coefficients(plane: Vector2<f64>) -> [Vector2<f64>; 5] {
+    let (r2, [by_p1, by_p2]) = (plane.norm_squared(), tangential_by_coefficients(plane));
+    [plane * r2, plane * (r2 * r2), by_p1, by_p2, plane * (r2 * r2 * r2)]
+}
+
+/// Derivatives of [`rational`] with respect to its coefficients.
+pub(crate) fn rational_by_coefficients(k: &[f64; 8], plane: Vector2<f64>) -> [Vector2<f64>; 8] {
+    let (r2, [by_p1, by_p2]) = (plane.norm_squared(), tangential_by_coefficients(plane));
+    let radial = rational_radial(k);
+    let by_numerator = plane / evaluate(&radial.denominator, r2);
+    let by_denominator = by_numerator * -radial.factor(r2).0;
+    let [first, second] = [by_numerator, by_denominator].map(|by| [by * r2, by * (r2 * r2), by * (r2 * r2 * r2)]);
+    [first[0], first[1], by_p1, by_p2, first[2], second[0], second[1], second[2]]
+}
+
+fn tangential_by_coefficients(plane: Vector2<f64>) -> [Vector2<f64>; 2] {
+    let (xy, r2) = (2.0 * plane.x * plane.y, plane.norm_squared());
+    [Vector2::new(xy, r2 + 2.0 * plane.y * plane.y), Vector2::new(r2 + 2.0 * plane.x * plane.x, xy)]
 }
 
 /// Applies Kannala-Brandt distortion (Kannala and Brandt 2006, equation 6, radial terms only), as in OpenCV's fisheye
@@ -115,112 +209,29 @@ pub(crate) fn undistort_kannala_brandt(k: &[f64; 4], distorted: Vector2<f64>) ->
         return Some(distorted);
     }
     let series = [1.0, k[0], k[1], k[2], k[3]];
-    let angle = solve_odd_polynomial(&series, &angle_derivative(k), length, std::f64::consts::FRAC_PI_2)?;
+    let derivative = angle_derivative(k);
+    let distorted_angle = |angle: f64| {
+        let angle2 = angle * angle;
+        (angle * evaluate(&series, angle2), evaluate(&derivative, angle2))
+    };
+    let is_rising_to = |angle: f64| positive_on(&derivative, angle * angle);
+    let angle = solve_rising(distorted_angle, is_rising_to, length, std::f64::consts::FRAC_PI_2)?;
     (angle < std::f64::consts::FRAC_PI_2).then(|| distorted * (angle.tan() / length))
 }
 
-/// The smallest `x` from 0 to `limit` with `x p(x²) = target`, if the derivative is positive from 0 up to it.
-///
-/// Uses Newton's method inside a bracket that shrinks with every step.
-fn solve_odd_polynomial(p: &[f64; 5], derivative: &[f64; 5], target: f64, limit: f64) -> Option<f64> {
-    const MAX_STEPS: usize = 200; // Bisection alone needs about 60 steps.
-    let value = |x: f64| x * evaluate(p, x * x) - target;
-    // Find a bracket: x from `low`, where the value is below the target, to `high`, where it is above or the
-    // derivative has changed sign.
-    let (mut low, mut high) = (0.0, target.min(limit));
-    let is_rising_to = |x: f64| positive_on(derivative, x * x);
-    while is_rising_to(high) && value(high) < 0.0 {
-        if high >= limit || high > f64::MAX.sqrt() * 0.25 {
-            return None;
-        }
-        low = high;
-        high = (2.0 * high).min(limit);
-    }
-    // Narrow the bracket.
-    let mut x = 0.5 * (low + high);
-    for _ in 0..MAX_STEPS {
-        let rising = is_rising_to(x);
-        if rising && value(x) < 0.0 {
-            low = x;
-        } else {
-            high = x;
-        }
-        // Beyond the maximum, Newton's method could converge to another root.
-        let newton = x - value(x) / evaluate(derivative, x * x);
-        let next = if rising && newton > low && newton < high { newton } else { 0.5 * (low + high) };
-        let step = (next - x).abs();
-        x = next;
-        if step <= CONVERGED * x || high - low <= CONVERGED * high {
-            break;
-        }
-    }
-    const CLOSE: f64 = 1e-12;
-    (is_rising_to(x) && value(x).abs() <= CLOSE * target.max(1.0)).then_some(x)
-}
-
-fn evaluate(p: &[f64; 5], s: f64) -> f64 {
-    p[0] + s * (p[1] + s * (p[2] + s * (p[3] + s * p[4])))
-}
-
-/// Whether a polynomial of degree 4 with `p[0] > 0` is positive from 0 to `end`.
-///
-/// The Bernstein coefficients on the interval bound the polynomial from below. If they are not conclusive, the interval
-/// is halved (Lane and Riesenfeld 1981). For a point well inside the range of the lens, the first test is conclusive.
-fn positive_on(p: &[f64; 5], end: f64) -> bool {
-    const MAX_HALVINGS: u32 = 30;
-    let mut power = [p[0], p[1] * end, 0.0, 0.0, 0.0];
-    let mut scale = end;
-    for degree in 2..5 {
-        scale *= end;
-        power[degree] = p[degree] * scale;
-    }
-    // Coefficient j is the sum over i <= j of choose(j, i) / choose(4, i) * power[i].
-    let [c0, c1, c2, c3, c4] = power;
-    let bernstein =
-        [c0, c0 + c1 / 4.0, c0 + c1 / 2.0 + c2 / 6.0, c0 + 0.75 * c1 + c2 / 2.0 + c3 / 4.0, c0 + c1 + c2 + c3 + c4];
-    all_positive(&bernstein, MAX_HALVINGS)
-}
-
-fn all_positive(bernstein: &[f64; 5], halvings_left: u32) -> bool {
-    if bernstein.iter().all(|&coefficient| coefficient > 0.0) {
-        return true;
-    }
-    // The first and last coefficients are values of the polynomial itself. The comparison is written so that NaN is
-    // not positive.
-    if !(bernstein[0] > 0.0 && bernstein[4] > 0.0) || halvings_left == 0 {
-        return false;
-    }
-    let (mut left, mut right) = ([0.0; 5], *bernstein);
-    for (level, first) in left.iter_mut().enumerate() {
-        *first = right[0];
-        for at in 0..4 - level {
-            right[at] = 0.5 * (right[at] + right[at + 1]);
-        }
-    }
-    // After de Casteljau's steps, `right` holds the coefficients of the right half.
-    all_positive(&left, halvings_left - 1) && all_positive(&right, halvings_left - 1)
+/// Derivatives of [`kannala_brandt`] with respect to its coefficients.
+pub(crate) fn kannala_brandt_by_coefficients(plane: Vector2<f64>) -> [Vector2<f64>; 4] {
+    let radius = plane.norm();
+    let angle = radius.atan();
+    // The quotient tends to 1 on the axis.
+    let direction = if radius > 0.0 { plane * (angle / radius) } else { plane };
+    let angle2 = angle * angle;
+    [direction * angle2, direction * angle2.powi(2), direction * angle2.powi(3), direction * angle2.powi(4)]
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn positive_polynomials_are_recognized() {
-        // (s - 1)² + dip has its minimum, dip, at 1.
-        let parabola = |dip: f64| [1.0 + dip, -2.0, 1.0, 0.0, 0.0];
-        assert!(positive_on(&parabola(1e-3), 5.0));
-        assert!(!positive_on(&parabola(-1e-3), 5.0));
-        assert!(positive_on(&parabola(-1e-3), 0.9));
-        // (s - 0.5)² (s - 2)² + dip has two minima.
-        let quartic = |dip: f64| [1.0 + dip, -5.0, 8.25, -5.0, 1.0];
-        assert!(positive_on(&quartic(1e-3), 3.0));
-        assert!(!positive_on(&quartic(-1e-3), 3.0));
-        assert!(!positive_on(&quartic(-1e-3), 1.0));
-        assert!(positive_on(&quartic(-1e-3), 0.4));
-        assert!(!positive_on(&[1.0, f64::NAN, 0.0, 0.0, 0.0], 1.0));
-        assert!(positive_on(&[1.0, 0.0, 0.0, 0.0, 0.0], 1e60));
-    }
 
     #[test]
     fn undistortion_inverts_strong_lenses() {
@@ -241,5 +252,41 @@ mod tests {
             }
             assert!(n_checked > 100, "{k:?}: only {n_checked} points inside the limit");
         }
+    }
+
+    #[test]
+    fn undistortion_inverts_rational_lenses() {
+        // The second has a pole at radius 2, and the third reaches its maximum below radius 1.4.
+        for k in [
+            [0.2, -0.05, 0.001, -0.0005, 0.01, 0.5, -0.02, 0.02],
+            [0.1, 0.0, 0.0, 0.0, 0.0, -0.25, 0.0, 0.0],
+            [-0.1, -0.05, 0.002, 0.001, 0.0, 0.1, 0.05, 0.01],
+        ] {
+            let mut n_checked = 0;
+            for step in 0..600 {
+                let radius = f64::from(step) * 0.005;
+                let plane = Vector2::new(radius * 0.6, radius * -0.8);
+                let Some(distorted) = rational(&k, plane) else { continue };
+                assert!(k[5] != -0.25 || radius < 2.0, "beyond the pole");
+                if distorted.jacobian.determinant() < 1e-3 || distorted.value.norm() > 10.0 {
+                    continue;
+                }
+                n_checked += 1;
+                let back = undistort_rational(&k, distorted.value).unwrap_or_else(|| panic!("{k:?} at {radius}"));
+                assert!((back - plane).norm() < 1e-11, "{k:?} at {radius}: off by {:e}", (back - plane).norm());
+            }
+            assert!(n_checked > 200, "{k:?}: only {n_checked} points inside the limit");
+        }
+    }
+
+    #[test]
+    fn rational_lens_without_denominator_is_brown_conrady() {
+        let k = [-0.28, 0.07, 0.001, -0.0005, 0.02];
+        let plane = Vector2::new(0.3, -0.4);
+        let [expected, actual] =
+            [brown_conrady(&k, plane), rational(&[k[0], k[1], k[2], k[3], k[4], 0.0, 0.0, 0.0], plane)]
+                .map(Option::unwrap);
+        assert!((expected.value - actual.value).norm() < 1e-15);
+        assert!((expected.jacobian - actual.jacobian).norm() < 1e-14);
     }
 }

@@ -44,8 +44,13 @@ impl Key for Intrinsics {
             (LensModel::Pinhole, coefficients) if coefficients.iter().all(|k| *k == 0.0) => Ok(Lens::Pinhole),
             (LensModel::Pinhole, _) => Err("none with lens = \"pinhole\"; set lens to brown_conrady or kannala_brandt"),
             (LensModel::BrownConrady, [k1, k2, p1, p2, k3]) => Ok(Lens::BrownConrady([*k1, *k2, *p1, *p2, *k3])),
+            (LensModel::BrownConrady, [k1, k2, p1, p2, k3, k4, k5, k6]) => {
+                Ok(Lens::RationalBrownConrady([*k1, *k2, *p1, *p2, *k3, *k4, *k5, *k6]))
+            }
             (LensModel::KannalaBrandt, [k1, k2, k3, k4]) => Ok(Lens::KannalaBrandt([*k1, *k2, *k3, *k4])),
-            _ => Err("5 (k1, k2, p1, p2, k3) for brown_conrady, 4 (k1, k2, k3, k4) for kannala_brandt"),
+            _ => Err(
+                "5 (k1, k2, p1, p2, k3) or 8 (k1, k2, p1, p2, k3, k4, k5, k6) for brown_conrady, 4 (k1, k2, k3, k4) for kannala_brandt",
+            ),
         };
         match lens {
             Ok(lens) => Some(Self { focal_px, principal_px, lens, ..PLACEHOLDER_INTRINSICS }),
@@ -57,6 +62,7 @@ impl Key for Intrinsics {
         let (lens, distortion): (_, &[f64]) = match &self.lens {
             Lens::Pinhole => (LensModel::Pinhole, &[]),
             Lens::BrownConrady(k) => (LensModel::BrownConrady, k),
+            Lens::RationalBrownConrady(k) => (LensModel::BrownConrady, k),
             Lens::KannalaBrandt(k) => (LensModel::KannalaBrandt, k),
         };
         let Self { focal_px, principal_px, .. } = *self;

@@ -98,6 +98,7 @@ mod with_sdk {
         let lens = match &intrinsics.lens {
             Lens::Pinhole => String::new(),
             Lens::BrownConrady(k) => format!(", lens = \"brown_conrady\", distortion = {k:?}"),
+            Lens::RationalBrownConrady(k) => format!(", lens = \"brown_conrady\", distortion = {k:?}"),
             Lens::KannalaBrandt(k) => format!(", lens = \"kannala_brandt\", distortion = {k:?}"),
         };
         format!("{{ focal_px = {:?}, principal_px = {:?}{lens} }}", intrinsics.focal_px, intrinsics.principal_px)

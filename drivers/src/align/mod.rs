@@ -42,6 +42,7 @@ enum ColorLens {
     Pinhole,
     BrownConrady([f32; 5]),
     KannalaBrandt([f32; 4]),
+    RationalBrownConrady([f32; 8]),
 }
 
 /// A corner of the pixels of one row of depth.
@@ -189,6 +190,10 @@ impl DepthAlignment {
                 let r2 = x * x + y * y;
                 (brown_conrady(k, x, y, r2), r2 <= max_radius_squared)
             }),
+            ColorLens::RationalBrownConrady(k) => project_by(columns, rows, counts, rays, &view, |x, y| {
+                let r2 = x * x + y * y;
+                (rational_brown_conrady(k, x, y, r2), r2 <= max_radius_squared)
+            }),
             ColorLens::KannalaBrandt(k) => project_by(columns, rows, counts, rays, &view, |x, y| {
                 let r2 = x * x + y * y;
                 (kannala_brandt(k, x, y, r2), r2 <= max_radius_squared)
@@ -265,6 +270,7 @@ impl ColorCamera {
             Lens::Pinhole => ColorLens::Pinhole,
             Lens::BrownConrady(k) => ColorLens::BrownConrady(k.map(narrow)),
             Lens::KannalaBrandt(k) => ColorLens::KannalaBrandt(k.map(narrow)),
+            Lens::RationalBrownConrady(k) => ColorLens::RationalBrownConrady(k.map(narrow)),
         };
         let max_radius = if matches!(lens, ColorLens::Pinhole) { f64::INFINITY } else { max_radius(camera) };
         Self {
@@ -292,6 +298,14 @@ fn max_radius(camera: &Intrinsics) -> f64 {
 #[inline(always)]
 fn brown_conrady([k1, k2, p1, p2, k3]: [f32; 5], x: f32, y: f32, r2: f32) -> [f32; 2] {
     let radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3));
+    let xy2 = 2.0 * x * y;
+    [x * radial + p1 * xy2 + p2 * (r2 + 2.0 * x * x), y * radial + p1 * (r2 + 2.0 * y * y) + p2 * xy2]
+}
+
+/// Distortion as defined in [`kinematics::Lens`].
+#[inline(always)]
+fn rational_brown_conrady([k1, k2, p1, p2, k3, k4, k5, k6]: [f32; 8], x: f32, y: f32, r2: f32) -> [f32; 2] {
+    let radial = (1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1.0 + r2 * (k4 + r2 * (k5 + r2 * k6)));
     let xy2 = 2.0 * x * y;
     [x * radial + p1 * xy2 + p2 * (r2 + 2.0 * x * x), y * radial + p1 * (r2 + 2.0 * y * y) + p2 * xy2]
 }
@@ -408,7 +422,10 @@ mod tests {
         let scene = scene(size_px);
         let fisheye = Lens::KannalaBrandt([-0.01, 0.02, -0.015, 0.003]);
         let d455 = Lens::BrownConrady([-0.0555, 0.0657, -0.0006, 0.0004, -0.0213]);
-        for (depth_lens, color_lens) in [(Lens::Pinhole, Lens::Pinhole), (Lens::Pinhole, d455), (d455, fisheye)] {
+        let rational = Lens::RationalBrownConrady([0.4, -0.1, 0.001, -0.0005, 0.01, 0.7, -0.02, 0.03]);
+        let lenses =
+            [(Lens::Pinhole, Lens::Pinhole), (Lens::Pinhole, d455), (d455, fisheye), (Lens::Pinhole, rational)];
+        for (depth_lens, color_lens) in lenses {
             // Squares are at most 2, 4, 7 and 2 columns wide. In the last case, several squares share a column.
             let cameras = [([320, 240], 300.0), ([640, 360], 455.0), ([1280, 720], 1000.0), ([160, 120], 140.0)];
             for (color_px, focal_px) in cameras {

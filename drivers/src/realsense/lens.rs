@@ -50,7 +50,8 @@ pub(super) fn intrinsics(raw: &sys::rs2_intrinsics, stream: &'static str) -> Res
     Ok(intrinsics)
 }
 
-/// Converts our intrinsics to those of the library, which supports the same models.
+/// Converts our intrinsics to those of the library. It has no rational model: the closest polynomial replaces it, or no
+/// distortion if none is close.
 #[cfg(feature = "emulation")]
 pub(super) fn raw(intrinsics: &Intrinsics) -> sys::rs2_intrinsics {
     let lens = if intrinsics.is_pinhole() { Lens::Pinhole } else { intrinsics.lens };
@@ -59,6 +60,17 @@ pub(super) fn raw(intrinsics: &Intrinsics) -> sys::rs2_intrinsics {
         Lens::BrownConrady(k) => (sys::rs2_distortion_RS2_DISTORTION_BROWN_CONRADY, k),
         Lens::KannalaBrandt([k1, k2, k3, k4]) => {
             (sys::rs2_distortion_RS2_DISTORTION_KANNALA_BRANDT4, [k1, k2, k3, k4, 0.0])
+        }
+        Lens::RationalBrownConrady(_) => {
+            let ([fx, fy], [cx, cy]) = (intrinsics.focal_px, intrinsics.principal_px);
+            let distort = |[x, y]: [f64; 2]| match intrinsics.project(&nalgebra::Vector3::new(x, y, 1.0)) {
+                Some([u, v]) => ([x, y], [(u - cx) / fx, (v - cy) / fy]),
+                None => ([x, y], [f64::NAN; 2]),
+            };
+            match fit_brown_conrady(&intrinsics.undistorted(), distort) {
+                Some(Lens::BrownConrady(k)) => (sys::rs2_distortion_RS2_DISTORTION_BROWN_CONRADY, k),
+                _ => (sys::rs2_distortion_RS2_DISTORTION_NONE, [0.0; 5]),
+            }
         }
     };
     let [width, height] = intrinsics.size_px.map(|side| i32::try_from(side).unwrap_or(i32::MAX));

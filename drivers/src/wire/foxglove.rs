@@ -180,6 +180,7 @@ pub fn encode_calibration(camera: &str, stamp: Stamp, intrinsics: &Intrinsics) -
         Lens::Pinhole => ("", &[]),
         Lens::BrownConrady(k) => ("plumb_bob", k),
         Lens::KannalaBrandt(k) => ("kannala_brandt", k),
+        Lens::RationalBrownConrady(k) => ("rational_polynomial", k),
     };
     let mut message = Message::default();
     message.message(1, &timestamp(stamp)).fixed32(2, intrinsics.size_px[0]).fixed32(3, intrinsics.size_px[1]);
