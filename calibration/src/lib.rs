@@ -23,8 +23,10 @@
 //! ```
 
 mod background;
+mod board;
 mod correction;
 mod error;
+pub mod least_squares;
 mod params;
 mod registration;
 #[cfg(any(test, feature = "scenes"))]
@@ -32,6 +34,7 @@ pub mod scenes;
 mod trial;
 
 pub use background::{AlignmentTask, MovementTask, alignment_step, run_in_background_pool};
+pub use board::{BoardPoint, BoardView};
 pub use correction::{
     CalibratedCamera, CameraCorrection, EMBEDDING_DIM, drift_weight, interpolate, rigid_transform, shares_lens,
 };

@@ -1,0 +1,105 @@
+//! Result of a minimization: parameters, uncertainty and observability.
+
+use super::{Evaluation, Options, Progress, normal_equations};
+use nalgebra::{DMatrix, DVector, SymmetricEigen};
+
+/// Result of [`super::minimize`].
+#[derive(Clone, Debug)]
+pub struct Fit<S> {
+    /// The parameters.
+    pub state: S,
+    /// Half the sum of the losses.
+    pub cost: f64,
+    /// Number of scalar residuals.
+    pub n_residuals: usize,
+    /// Number of shared and local parameters.
+    pub n_params: usize,
+    /// Variance of a scalar residual, estimated from the residuals.
+    pub variance: f64,
+    /// Information about the shared parameters with free local parameters, for residuals of unit variance.
+    pub information: DMatrix<f64>,
+    /// Covariance of the shared parameters. Entries of unobservable parameters are very large, but finite.
+    pub covariance: DMatrix<f64>,
+    /// Orthogonal directions of the shared parameters, the least observable first.
+    pub directions: Vec<Direction>,
+    /// Whether the last step was negligible.
+    pub converged: bool,
+    /// Number of steps, including rejected ones.
+    pub n_steps: usize,
+}
+
+/// An eigenvector of the information about the shared parameters, in units of their scales.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Direction {
+    /// Unit vector; component `i` is the change of shared parameter `i` divided by its scale.
+    pub components: DVector<f64>,
+    /// Standard deviation along the vector, as a multiple of the scales. Above about 1, the residuals do not
+    /// determine this direction.
+    pub sigma: f64,
+}
+
+impl<S> Fit<S> {
+    /// Standard deviation of a shared parameter.
+    pub fn sigma(&self, param_ix: usize) -> f64 {
+        self.covariance[(param_ix, param_ix)].max(0.0).sqrt()
+    }
+}
+
+/// Relative size of an eigenvalue that cannot be distinguished from zero.
+const ROUNDING: f64 = 1e-15;
+
+pub(super) fn fit<S>(
+    at: Evaluation<S>,
+    scales: &DVector<f64>,
+    n_params: usize,
+    options: &Options,
+    progress: Progress,
+) -> Fit<S> {
+    let information = normal_equations::information(&at.blocks, scales.len());
+    let (variance, covariance_factor) = variances(&at, n_params, options.min_noise);
+    let scaled = DMatrix::from_diagonal(scales) * &information * DMatrix::from_diagonal(scales);
+    let eigen = SymmetricEigen::new(scaled);
+    let floor = (ROUNDING * eigen.eigenvalues.iter().copied().fold(0.0, f64::max)).max(f64::MIN_POSITIVE / ROUNDING);
+    let mut directions: Vec<Direction> = eigen
+        .eigenvalues
+        .iter()
+        .zip(eigen.eigenvectors.column_iter())
+        .map(|(value, vector)| Direction {
+            components: vector.into_owned(),
+            sigma: (covariance_factor / value.max(floor)).sqrt(),
+        })
+        .collect();
+    directions.sort_by(|a, b| b.sigma.total_cmp(&a.sigma));
+    let mut covariance = DMatrix::zeros(scales.len(), scales.len());
+    for direction in &directions {
+        let vector = direction.components.component_mul(scales) * direction.sigma;
+        covariance.ger(1.0, &vector, &vector, 1.0);
+    }
+    Fit {
+        state: at.state,
+        cost: 0.5 * at.totals.loss,
+        n_residuals: at.totals.n_scalars,
+        n_params,
+        variance,
+        information,
+        covariance,
+        directions,
+        converged: progress.converged,
+        n_steps: progress.n_steps,
+    }
+}
+
+/// Variance of a scalar residual, and the factor between the inverse of the weighted information and the covariance.
+/// Both are equal for the squared loss.
+///
+/// Source: Huber 1981, section 7.6, equation 6.7 without the factor `K`, which is close to 1.
+fn variances<S>(at: &Evaluation<S>, n_params: usize, min_noise: f64) -> (f64, f64) {
+    let totals = &at.totals;
+    let n_vectors = totals.n_vectors as f64;
+    let n_free = (totals.n_scalars - n_params) as f64;
+    // More than 95 % outliers would make the derivative too small to divide by.
+    let influence_derivative = (totals.influence_derivatives / n_vectors).max(0.05);
+    let mean_weight = (totals.weights / n_vectors).max(f64::MIN_POSITIVE);
+    let variance = (totals.weighted_squares / n_free / influence_derivative.powi(2)).max(min_noise * min_noise);
+    (variance, variance * mean_weight)
+}

@@ -1,0 +1,140 @@
+//! Robust nonlinear least squares with shared parameters and local parameters per block.
+//!
+//! Levenberg-Marquardt (Marquardt 1963) with the damping schedule of Nielsen 1999 and robust losses by iteratively
+//! reweighted least squares. Local parameters, such as the pose of one view, are eliminated by a Schur complement
+//! (Triggs et al. 2000, section 6.1), so the cost of a step grows linearly with the number of blocks. Without local
+//! parameters, the solver is a dense one.
+
+mod fit;
+mod loss;
+mod normal_equations;
+#[cfg(test)]
+mod tests;
+
+pub use fit::{Direction, Fit};
+pub use loss::Loss;
+pub use normal_equations::BlockSums;
+
+use crate::Error;
+use nalgebra::DVector;
+use normal_equations::Totals;
+
+/// A least-squares problem. The residuals of a block depend on the shared parameters and on the block's local ones.
+pub trait Problem {
+    /// Values of all parameters.
+    type State: Clone;
+
+    /// Typical magnitude of each shared parameter, all positive: a change of this size is large. Its length is the
+    /// number of shared parameters.
+    fn scales(&self) -> DVector<f64>;
+
+    /// Number of blocks.
+    fn n_blocks(&self) -> usize;
+
+    /// Number of local parameters of a block. 0 for residuals that depend on shared parameters only.
+    fn n_local(&self, block_ix: usize) -> usize;
+
+    /// Adds the residuals of a block and their derivatives with respect to a small step from this state. Returns `None`
+    /// if a residual is not defined, for example because a point lies behind the camera.
+    fn evaluate(&self, state: &Self::State, block_ix: usize, sums: &mut BlockSums) -> Option<()>;
+
+    /// The state after a step.
+    ///
+    /// * `local`: one vector per block.
+    fn moved(&self, state: &Self::State, shared: &DVector<f64>, local: &[DVector<f64>]) -> Self::State;
+}
+
+/// Settings of [`minimize`].
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Options {
+    /// Loss of the residual vectors.
+    pub loss: Loss,
+    /// Maximum number of steps, including rejected ones.
+    pub max_steps: usize,
+    /// Lower limit of the residuals' standard deviation, in units of the residuals. It limits the stated accuracy where
+    /// the residuals are smaller than any measurement could be, and decides when steps are too small to matter.
+    pub min_noise: f64,
+}
+
+impl Default for Options {
+    fn default() -> Self {
+        Self { loss: Loss::Squared, max_steps: 100, min_noise: 1e-9 }
+    }
+}
+
+/// Minimizes the sum of the losses from an initial state.
+///
+/// # Errors
+/// If a residual is not defined at the initial state, or if there are not more residuals than parameters.
+pub fn minimize<P: Problem>(problem: &P, initial: P::State, options: &Options) -> Result<Fit<P::State>, Error> {
+    /// A step whose predicted decrease is below this fraction of the cost does not matter.
+    const CONVERGED: f64 = 1e-12;
+    const INITIAL_DAMPING: f64 = 1e-4;
+    const MIN_DAMPING: f64 = 1e-15;
+    const MAX_DAMPING: f64 = 1e12;
+    let scales = problem.scales();
+    let n_shared = scales.len();
+    let mut at =
+        Evaluation::new(problem, initial, options.loss).map_err(|block_ix| Error::UndefinedResidual { block_ix })?;
+    let n_params = n_shared + at.blocks.iter().map(BlockSums::n_local).sum::<usize>();
+    if at.totals.n_scalars <= n_params {
+        return Err(Error::TooFewResiduals { n_residuals: at.totals.n_scalars, n_params });
+    }
+    let noise_floor = at.totals.n_scalars as f64 * options.min_noise.powi(2);
+    let (mut damping, mut growth) = (INITIAL_DAMPING, 2.0);
+    let (mut converged, mut n_steps) = (false, 0);
+    while n_steps < options.max_steps && !converged && damping < MAX_DAMPING {
+        n_steps += 1;
+        let trial = normal_equations::step(&at.blocks, n_shared, damping).and_then(|step| {
+            converged = step.predicted <= CONVERGED * 0.5 * (at.totals.loss + noise_floor);
+            let state = problem.moved(&at.state, &step.shared, &step.local);
+            let trial = Evaluation::new(problem, state, options.loss).ok()?;
+            let gain = 0.5 * (at.totals.loss - trial.totals.loss) / step.predicted;
+            (trial.totals.loss < at.totals.loss).then_some((trial, gain))
+        });
+        match trial {
+            Some((trial, gain)) => {
+                at = trial;
+                damping = (damping * (1.0 - (2.0 * gain - 1.0).powi(3)).max(1.0 / 10.0)).max(MIN_DAMPING);
+                growth = 2.0;
+            }
+            None => {
+                damping *= growth;
+                growth *= 2.0;
+            }
+        }
+    }
+    Ok(fit::fit(at, &scales, n_params, options, Progress { converged, n_steps }))
+}
+
+/// How the minimization ended.
+struct Progress {
+    converged: bool,
+    n_steps: usize,
+}
+
+/// The problem at one state.
+struct Evaluation<S> {
+    state: S,
+    blocks: Vec<BlockSums>,
+    totals: Totals,
+}
+
+impl<S: Clone> Evaluation<S> {
+    /// # Errors
+    /// The block with a residual that is not defined.
+    fn new<P: Problem<State = S>>(problem: &P, state: S, loss: Loss) -> Result<Self, usize> {
+        let n_shared = problem.scales().len();
+        let (mut blocks, mut totals) = (Vec::with_capacity(problem.n_blocks()), Totals::default());
+        for block_ix in 0..problem.n_blocks() {
+            let mut sums = BlockSums::new(loss, n_shared, problem.n_local(block_ix));
+            problem.evaluate(&state, block_ix, &mut sums).ok_or(block_ix)?;
+            if !sums.totals.loss.is_finite() {
+                return Err(block_ix);
+            }
+            totals.add(&sums.totals);
+            blocks.push(sums);
+        }
+        Ok(Self { state, blocks, totals })
+    }
+}
