@@ -1,7 +1,9 @@
 //! Errors of calibration.
 
+use crate::hand_eye::Refusal;
+
 /// An error of calibration.
-#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
     /// A bug: the alignment thread panicked.
@@ -25,4 +27,13 @@ pub enum Error {
         /// Number of parameters.
         n_params: usize,
     },
+    /// The input of a hand-eye calibration is invalid.
+    #[error("hand-eye: {why}")]
+    HandEyeInput {
+        /// What is wrong, with the value found and the value expected.
+        why: String,
+    },
+    /// The measurements do not determine the result, or a mistake in them explains why they disagree.
+    #[error("refused: {0}")]
+    Refused(Box<Refusal>),
 }

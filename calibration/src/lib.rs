@@ -5,7 +5,7 @@
 //! estimated. [`align`] estimates them by registering keyframes with depth, keeps those that improve validation images
 //! ([`Trial`]), and reports their uncertainty. Without depth, it estimates extrinsics from matched features.
 //! [`AlignmentTask`] runs [`align`] in parallel with training. [`register_station`] estimates the pose of a mobile base
-//! at one station.
+//! at one station. [`hand_eye`] calibrates a camera with a target.
 //!
 //! ```
 //! use calibration::CameraCorrection;
@@ -26,6 +26,7 @@ mod background;
 mod board;
 mod correction;
 mod error;
+pub mod hand_eye;
 pub mod least_squares;
 mod params;
 mod registration;
