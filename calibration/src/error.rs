@@ -33,6 +33,12 @@ pub enum Error {
         /// What is wrong, with the value found and the value expected.
         why: String,
     },
+    /// The input of a time offset estimation is invalid.
+    #[error("time offset: {why}")]
+    TimeOffsetInput {
+        /// What is wrong, with the value found and the value expected.
+        why: String,
+    },
     /// The measurements do not determine the result, or a mistake in them explains why they disagree.
     #[error("refused: {0}")]
     Refused(Box<Refusal>),
