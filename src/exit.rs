@@ -71,7 +71,8 @@ fn class_of(error: &(dyn std::error::Error + 'static)) -> Option<ErrorClass> {
     let of_session = || Some(error.downcast_ref::<session::Error>()?.class());
     let of_capture = || Some(error.downcast_ref::<capture::Error>()?.class());
     let of_keyframe = || Some(error.downcast_ref::<keyframe::Error>()?.class());
-    of_session().or_else(of_capture).or_else(of_keyframe)
+    let of_calibration = || Some(error.downcast_ref::<calibration::Error>()?.class());
+    of_session().or_else(of_capture).or_else(of_keyframe).or_else(of_calibration)
 }
 
 /// Whether a command was rejected because of bad arguments or insufficient data.

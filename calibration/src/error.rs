@@ -1,7 +1,10 @@
 //! Errors of calibration.
 
+use crate::hand_eye::Refusal;
+use keyframe::ErrorClass;
+
 /// An error of calibration.
-#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
     /// A bug: the alignment thread panicked.
@@ -115,4 +118,43 @@ pub enum Error {
         /// Largest angle between the target and the image plane, degrees.
         max_tilt_deg: String,
     },
+    /// The input of a hand-eye calibration is invalid.
+    #[error("hand-eye: {why}")]
+    HandEyeInput {
+        /// What is wrong, with the value found and the value expected.
+        why: String,
+    },
+    /// The input of a time offset estimation is invalid.
+    #[error("time offset: {why}")]
+    TimeOffsetInput {
+        /// What is wrong, with the value found and the value expected.
+        why: String,
+    },
+    /// The measurements do not determine the result, or a mistake in them explains why they disagree.
+    #[error("refused: {0}")]
+    Refused(Box<Refusal>),
+}
+
+impl Error {
+    /// Whether the input is invalid, the measurements are insufficient, or the calibration failed.
+    pub fn class(&self) -> ErrorClass {
+        match self {
+            Self::AlignmentPanicked | Self::UndefinedResidual { .. } => ErrorClass::Failed,
+            Self::ImageSizes { .. }
+            | Self::MixedImageSizes { .. }
+            | Self::EmptyImage { .. }
+            | Self::NonFinitePoint { .. }
+            | Self::TargetSize { .. }
+            | Self::TargetNotFlat { .. }
+            | Self::HandEyeInput { .. }
+            | Self::TimeOffsetInput { .. } => ErrorClass::BadInput,
+            Self::TooFewResiduals { .. }
+            | Self::TooFewImages { .. }
+            | Self::NoLensFits
+            | Self::TargetMismatch { .. }
+            | Self::FocalLengthUnobservable { .. }
+            | Self::PrincipalPointUnobservable { .. }
+            | Self::Refused(_) => ErrorClass::InsufficientData,
+        }
+    }
 }

@@ -5,7 +5,8 @@
 //! estimated. [`align`] estimates them by registering keyframes with depth, keeps those that improve validation images
 //! ([`Trial`]), and reports their uncertainty. Without depth, it estimates extrinsics from matched features.
 //! [`AlignmentTask`] runs [`align`] in parallel with training. [`register_station`] estimates the pose of a mobile base
-//! at one station.
+//! at one station. [`hand_eye`] calibrates a camera with a target, and [`time_offset`] finds the offset between the
+//! clocks of two pose streams.
 //!
 //! [`calibrate_intrinsics`] estimates focal length, principal point and lens of one camera from images of a flat
 //! calibration target.
@@ -29,12 +30,14 @@ mod background;
 mod board;
 mod correction;
 mod error;
+pub mod hand_eye;
 mod intrinsics;
 pub mod least_squares;
 mod params;
 mod registration;
 #[cfg(any(test, feature = "scenes"))]
 pub mod scenes;
+pub mod time_offset;
 mod trial;
 
 pub use background::{AlignmentTask, MovementTask, alignment_step, run_in_background_pool};

@@ -142,7 +142,11 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     };
     let printed = Printed { samples: printed.samples.into_iter().chain(samples.unused).collect(), ..printed };
     let exit = if printed.refused.is_some() { Exit::InsufficientData } else { Exit::Done };
-    if args.json { print::json(&printed)? } else { describe(&printed)? }
+    if args.json {
+        print::json(&printed)?
+    } else {
+        describe(&printed)?
+    }
     Ok(exit)
 }
 
@@ -195,7 +199,8 @@ impl SamplesFile {
         for (ix, entry) in self.samples.iter().enumerate() {
             let number = format!("sample {ix}");
             let transform = |key: &str, value: &serde_json::Value| {
-                transform_of(value).map_err(|reason| BadArgument(format!("{}: {number}: {key}: {reason}", path.display())))
+                transform_of(value)
+                    .map_err(|reason| BadArgument(format!("{}: {number}: {key}: {reason}", path.display())))
             };
             let base_from_flange = transform("base_from_flange", &entry.base_from_flange)?;
             let (name, board) = match (&entry.camera_from_board, &entry.image) {

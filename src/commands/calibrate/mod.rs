@@ -1,10 +1,12 @@
 //! `fieldrig calibrate`: calibrates cameras, with a printed target or from images of any static scene.
 
+mod hand_eye;
 mod images;
 mod intrinsics;
 mod lens;
 mod scene;
 mod target;
+mod time_offset;
 
 use crate::exit::Exit;
 use clap::{Parser, Subcommand};
@@ -22,10 +24,14 @@ pub(crate) struct Args {
 enum CalibrateCommand {
     /// Write a calibration target to print
     Target(target::Args),
-    /// Lens of a camera from images of a target
+    /// Estimate the lens of a camera from images of a target
     Intrinsics(intrinsics::Args),
-    /// Hand-eye transform, time offset, lens, joint and depth errors of a rig from images of a static scene, without a
-    /// target
+    /// Estimate the pose of a camera on a robot from robot poses and images of a target
+    HandEye(hand_eye::Args),
+    /// Estimate the offset between the clocks of two pose streams, and the transform between their bodies
+    TimeOffset(time_offset::Args),
+    /// Estimate hand-eye transforms, time offsets, lenses, joint offsets and depth errors of a rig from images of a
+    /// static scene, without a target
     Scene(scene::Args),
 }
 
@@ -33,6 +39,8 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     match &args.command {
         CalibrateCommand::Target(args) => target::run(args).map(|()| Exit::Done),
         CalibrateCommand::Intrinsics(args) => intrinsics::run(args),
+        CalibrateCommand::HandEye(args) => hand_eye::run(args),
+        CalibrateCommand::TimeOffset(args) => time_offset::run(args),
         CalibrateCommand::Scene(args) => scene::run(args),
     }
 }

@@ -28,7 +28,7 @@ use keyframe::{Keyframe, Split};
 use kinematics::Transform;
 use kinematics::quantile::{Rank, quantile};
 use moving_camera::MovingCamera;
-use nalgebra::{DVector, Vector3};
+use nalgebra::DVector;
 use rayon::prelude::*;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;

@@ -1,0 +1,62 @@
+//! Errors of a solution: scatter of the board and leave-one-out prediction.
+
+use super::Setup;
+use super::geometry::{self, Solution};
+use super::pose_fit::{self, HandEyeNoise, Measurement};
+use crate::BoardPoint;
+use kinematics::{Intrinsics, Transform};
+
+/// How much the poses of the board that the samples imply differ.
+///
+/// For each sample, `board_i = base_from_flange_i * flange_from_camera * camera_from_board_i` (eye in hand), or
+/// `flange_from_base_i * base_from_camera * camera_from_board_i` (eye to hand). The scatter of the position is the RMS
+/// distance of the origin of `board_i` from the mean over the samples. The scatter of the rotation is the RMS angle
+/// between the rotation of `board_i` and the mean rotation (least squares over rotation matrices).
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Scatter {
+    /// Position, millimeters.
+    pub mm: f64,
+    /// Rotation, degrees.
+    pub deg: f64,
+}
+
+/// Scatter of board poses. `None` without poses.
+pub(super) fn scatter(boards: &[Transform]) -> Option<Scatter> {
+    let mean = geometry::mean(boards)?;
+    let rms = |squares: f64| (squares / boards.len() as f64).sqrt();
+    let distances = boards.iter().map(|board| (board.translation.vector - mean.translation.vector).norm_squared());
+    let angles = boards.iter().map(|board| board.rotation.angle_to(&mean.rotation).powi(2));
+    Some(Scatter { mm: 1e3 * rms(distances.sum()), deg: rms(angles.sum()).to_degrees() })
+}
+
+/// Solution of all measurements but one, for each of them.
+///
+/// * `knows_noise`: keeps the given noise, which is faster than estimating it without the measurement.
+pub(super) fn leave_one_out(
+    setup: Setup,
+    measurements: &[Measurement],
+    solution: Solution,
+    noise: HandEyeNoise,
+    knows_noise: bool,
+) -> Vec<Option<Solution>> {
+    (0..measurements.len())
+        .map(|left_out| {
+            let mut others = measurements.to_vec();
+            others.remove(left_out);
+            (others.len() >= 3).then_some(())?;
+            let fit = if knows_noise { pose_fit::fit_with_known_noise } else { pose_fit::fit };
+            Some(fit(setup, &others, solution, noise).ok()?.solution)
+        })
+        .collect()
+}
+
+/// Sum of squared reprojection errors, square pixels; infinite if a point cannot be projected.
+pub(super) fn reprojection_squares(pose: &Transform, points: &[BoardPoint], intrinsics: &Intrinsics) -> f64 {
+    points
+        .iter()
+        .map(|point| match intrinsics.project(&(pose * nalgebra::Point3::from(point.point_in_board)).coords) {
+            Some(pixel) => (pixel[0] - point.pixel[0]).powi(2) + (pixel[1] - point.pixel[1]).powi(2),
+            None => f64::INFINITY,
+        })
+        .sum()
+}

@@ -1,0 +1,151 @@
+//! Names common mistakes in the input: wrong units, inverted transforms, mirrored boards.
+
+use super::closed_form::{self, ClosedForm};
+use super::consensus::{self, Consensus};
+use super::refusal::Refusal;
+use super::samples::Sample;
+use super::{BoardObservation, HandEyeSample, Setup};
+use kinematics::Transform;
+
+/// Positions of a robot or distances of a board in meters do not exceed this; in millimeters they do.
+const MAX_POSITION_M: f64 = 20.0;
+
+/// A variant of the input explains it if it fits better by this factor.
+const MUCH_BETTER: f64 = 5.0;
+
+/// Checks that the positions can be meters.
+///
+/// # Errors
+/// If most of them are too large.
+pub(super) fn check_magnitudes(samples: &[HandEyeSample]) -> Result<(), Refusal> {
+    let robot: Vec<f64> = samples.iter().map(|sample| sample.base_from_flange.translation.vector.norm()).collect();
+    let board: Vec<f64> = samples
+        .iter()
+        .filter_map(|sample| match &sample.board {
+            BoardObservation::Pose(pose) => Some(pose.translation.vector.norm()),
+            BoardObservation::View(view) => {
+                view.points.iter().map(|point| point.point_in_board.norm()).reduce(f64::max)
+            }
+        })
+        .collect();
+    for (name, values) in [("base_from_flange", robot), ("the board", board)] {
+        let median = kinematics::quantile::median(&values).unwrap_or(0.0);
+        if median > MAX_POSITION_M {
+            return Err(Refusal::new(
+                format!(
+                    "the positions of {name} have a typical size of {median:.1}; meters are expected, and these look like millimeters"
+                ),
+                format!("divide the positions of {name} by 1000"),
+            ));
+        }
+    }
+    Ok(())
+}
+
+/// The mistake that explains why the samples disagree. `None` if they agree or no known mistake explains it.
+pub(super) fn explain(setup: Setup, samples: &[Sample], consensus: Option<&Consensus>) -> Option<Refusal> {
+    /// A calibrated camera predicts the board within this fraction of its distance.
+    const GOOD_FRAC: f64 = 0.02;
+    let distances: Vec<f64> =
+        samples.iter().map(|sample| sample.candidates[0].camera_from_board.translation.vector.norm()).collect();
+    let distance_m = kinematics::quantile::median(&distances)?;
+    let found_m = consensus.map_or(f64::INFINITY, Consensus::median_m);
+    let residual = if found_m.is_finite() {
+        format!("the samples disagree by {:.0} mm (median, board at {:.0} mm)", 1e3 * found_m, 1e3 * distance_m)
+    } else {
+        "no hand-eye transform explains three of the samples".to_owned()
+    };
+    if let Some(scale) = scale_mistake(samples, consensus) {
+        return Some(Refusal::new(format!("{residual}, and {}", scale.0), scale.1));
+    }
+    if found_m <= GOOD_FRAC * distance_m {
+        return None;
+    }
+    let has_poses = samples.iter().all(|sample| sample.candidates.iter().all(|candidate| candidate.corners.is_none()));
+    // Inverting either transform swaps the unknowns, so the data cannot tell which one was inverted.
+    let variant: Vec<Sample> =
+        samples.iter().map(|sample| Sample { a: sample.a.inverse(), ..sample.clone() }).collect();
+    let variant_m = consensus::find(&variant)?.median_m();
+    if variant_m * MUCH_BETTER > found_m.min(distance_m) || variant_m > 2.0 * GOOD_FRAC * distance_m {
+        return None;
+    }
+    let fits = format!("{residual}; they agree within {:.1} mm if", 1e3 * variant_m);
+    let other = match setup {
+        Setup::EyeInHand => "eye to hand",
+        Setup::EyeToHand => "eye in hand",
+    };
+    let robot =
+        format!("base_from_flange is inverted: the given matrices are flange_from_base, or the setup is {other}");
+    let robot_remedy = format!("invert the robot poses, or choose the setup {other}");
+    let board = "camera_from_board is inverted: the given matrices are board_from_camera";
+    // The camera sees only boards in front of it.
+    let n_in_front = |invert: bool| {
+        let z = |sample: &&Sample| {
+            let pose = sample.candidates[0].camera_from_board;
+            (if invert { pose.inverse() } else { pose }).translation.z
+        };
+        samples.iter().filter(|sample| z(sample) > 0.0).count()
+    };
+    Some(match (n_in_front(false) == samples.len() || !has_poses, has_poses && n_in_front(true) == samples.len()) {
+        (true, false) => Refusal::new(format!("{fits} {robot}"), robot_remedy),
+        (false, _) => Refusal::new(format!("{fits} {board}"), "invert the board poses"),
+        (true, true) => {
+            Refusal::new(format!("{fits} {robot}; or if {board}"), format!("{robot_remedy}, or invert the board poses"))
+        }
+    })
+}
+
+/// Explanation by different units of the robot's and the board's translations, and the remedy.
+fn scale_mistake(samples: &[Sample], consensus: Option<&Consensus>) -> Option<(String, String)> {
+    const MIN_SIGMAS: f64 = 5.0;
+    const MIN_CHANGE: f64 = 0.02;
+    const BETTER: f64 = 3.0;
+    let choice = consensus.map_or_else(|| vec![0; samples.len()], |found| found.choice.clone());
+    let pairs: Vec<(Transform, Transform)> = samples
+        .iter()
+        .zip(&choice)
+        .map(|(sample, choice)| (sample.a, sample.candidates[*choice].camera_from_board))
+        .collect();
+    let motions = closed_form::motions(&pairs);
+    let rotation = ClosedForm::ParkMartin.solve(&motions)?.rotation;
+    let (scale, sigma) = closed_form::relative_scale(&motions, rotation)?;
+    if scale.is_nan() || scale <= 0.0 || (scale - 1.0).abs() < MIN_CHANGE.max(MIN_SIGMAS * sigma) {
+        return None;
+    }
+    // The scale must explain the disagreement.
+    let mut scaled: Vec<Sample> = samples.to_vec();
+    for candidate in scaled.iter_mut().flat_map(|sample| &mut sample.candidates) {
+        candidate.camera_from_board.translation.vector *= scale;
+    }
+    let explained_m = consensus::find(&scaled)?.median_m() / scale.max(1.0);
+    if explained_m * BETTER > consensus.map_or(f64::INFINITY, Consensus::median_m) {
+        return None;
+    }
+    let near = |expected: f64| (scale / expected - 1.0).abs() < 0.1;
+    Some(if near(1000.0) {
+        (
+            "the positions of the robot are 1000 times too large for those of the board: millimeters instead of meters"
+                .to_owned(),
+            "divide the positions of base_from_flange by 1000".to_owned(),
+        )
+    } else if near(0.001) {
+        (
+            "the positions of the board are 1000 times too large for those of the robot: millimeters instead of meters"
+                .to_owned(),
+            "divide the positions of camera_from_board, or the size of the board, by 1000".to_owned(),
+        )
+    } else {
+        (
+            format!("the motions of the robot are {scale:.3} times (+-{sigma:.3}) those of the board"),
+            format!("check the size of the squares: it seems to be {scale:.3} times the given one"),
+        )
+    })
+}
+
+/// Names of the samples whose board is seen from the other side than in most samples: its corners are mirrored.
+pub(super) fn mirrored<'a>(samples: &'a [HandEyeSample], poses: &[(usize, Transform)]) -> Vec<&'a str> {
+    let is_front = |pose: &Transform| (pose.rotation * nalgebra::Vector3::z()).dot(&pose.translation.vector) > 0.0;
+    let n_front = poses.iter().filter(|(_, pose)| is_front(pose)).count();
+    let majority = 2 * n_front >= poses.len();
+    poses.iter().filter(|(_, pose)| is_front(pose) != majority).map(|(ix, _)| samples[*ix].name.as_str()).collect()
+}

@@ -1,0 +1,247 @@
+//! Hand-eye calibration with a target: pose of a camera on the flange or beside the robot.
+//!
+//! [`calibrate_hand_eye`] takes robot poses and, for each, the pose of a board in the camera or its corners in the image.
+//! Closed-form solutions of sample triples give an initial solution that most samples agree with. Generalized least
+//! squares over board poses follow, with noise variances estimated by restricted maximum likelihood. With corners, the
+//! reprojection error is minimized, and each robot pose has a small unknown error. The result has an uncertainty and
+//! leave-one-out errors; input that does not determine the result is refused.
+
+mod closed_form;
+mod consensus;
+mod corner_fit;
+mod evaluation;
+mod excitation;
+mod geometry;
+mod mistakes;
+mod next_poses;
+mod planar_pose;
+mod pose_fit;
+mod refine;
+mod refusal;
+mod report;
+mod samples;
+#[cfg(test)]
+pub(crate) mod scene;
+#[cfg(test)]
+mod tests;
+
+pub use closed_form::ClosedForm;
+pub(crate) use closed_form::nearest_rotation;
+pub use evaluation::Scatter;
+pub use next_poses::{NextPose, NextPoseOptions, suggest_next_poses};
+pub use pose_fit::HandEyeNoise;
+pub use refusal::Refusal;
+pub use report::{HandEyeCalibration, JointOffset, SampleReport, SampleStatus};
+
+use crate::{BoardView, Error};
+use kinematics::{Chain, Intrinsics, Transform, transform};
+
+/// Where the camera and the board are mounted.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Setup {
+    /// The camera is on the flange, and the board is fixed to the base.
+    EyeInHand,
+    /// The camera is fixed to the base, and the board is on the flange.
+    EyeToHand,
+}
+
+/// What the camera measured in one sample.
+#[derive(Clone, Debug, PartialEq)]
+pub enum BoardObservation {
+    /// Pose of the board, `camera_from_board`.
+    Pose(Transform),
+    /// Corners in the image.
+    View(BoardView),
+}
+
+/// One robot pose and what the camera measured there.
+#[derive(Clone, Debug, PartialEq)]
+pub struct HandEyeSample {
+    /// File name or number, for messages.
+    pub name: String,
+    /// Pose that the robot reported.
+    pub base_from_flange: Transform,
+    /// The board in the camera.
+    pub board: BoardObservation,
+    /// Joint values in the order of the chain, radians or meters. Needed for joint offsets only.
+    pub joints: Option<Vec<f64>>,
+}
+
+/// Input of [`calibrate_hand_eye`].
+#[derive(Clone, Debug)]
+pub struct HandEyeInput<'a> {
+    /// Where the camera is mounted.
+    pub setup: Setup,
+    /// At least three samples, all with poses or all with corners.
+    pub samples: Vec<HandEyeSample>,
+    /// Lens parameters. Needed for corners; initial values if they are estimated.
+    pub intrinsics: Option<Intrinsics>,
+    /// Rotations of the board after which it looks the same, `board_from_equivalent_board`: for example a half turn about
+    /// the center of a chessboard with an odd number of squares along both sides. Empty if the board is unique.
+    pub board_symmetries: &'a [Transform],
+    /// The arm, for joint offsets.
+    pub chain: Option<&'a Chain>,
+    /// What to estimate, and when to refuse.
+    pub options: HandEyeOptions,
+}
+
+/// Options of [`calibrate_hand_eye`].
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct HandEyeOptions {
+    /// Estimates the intrinsics together with the hand-eye transform. Needs corners.
+    pub estimate_intrinsics: bool,
+    /// Estimates offsets of the joints except the first and the last. Needs corners, joint values and a chain.
+    pub estimate_joint_offsets: bool,
+    /// Refuses a result with a larger standard deviation of the position along any direction, meters.
+    pub max_sigma_m: f64,
+    /// Refuses a result with a larger standard deviation of the rotation around any axis, radians.
+    pub max_sigma_rad: f64,
+}
+
+impl Default for HandEyeOptions {
+    fn default() -> Self {
+        Self {
+            estimate_intrinsics: false,
+            estimate_joint_offsets: false,
+            max_sigma_m: 0.01,
+            max_sigma_rad: 1.0_f64.to_radians(),
+        }
+    }
+}
+
+/// Minimum number of samples.
+pub const MIN_SAMPLES: usize = 3;
+
+/// Estimates the pose of the camera on the flange (eye in hand) or in the base (eye to hand), and that of the board.
+///
+/// # Errors
+/// [`Error::Refused`] if the samples do not determine the result or contain a mistake: the message names the reason and
+/// the remedy. [`Error::HandEyeInput`] if the input is invalid.
+///
+/// ```
+/// use calibration::hand_eye::{BoardObservation, HandEyeInput, HandEyeOptions, HandEyeSample, Setup, calibrate_hand_eye};
+/// use kinematics::Transform;
+/// use nalgebra::Vector3;
+///
+/// let flange_from_camera = Transform::new(Vector3::new(0.05, 0.0, 0.06), Vector3::new(0.0, 0.0, 1.5));
+/// let base_from_board = Transform::new(Vector3::new(0.5, 0.1, 0.0), Vector3::new(3.0, 0.0, 0.0));
+/// let samples = [[0.3, 0.0, 0.0], [0.0, 0.4, 0.0], [-0.2, 0.1, 0.5], [0.3, -0.4, 0.2]].map(|tilt| {
+///     let base_from_flange = Transform::new(Vector3::new(0.4, 0.0, 0.5), Vector3::new(3.0, 0.0, 0.0) + Vector3::from(tilt));
+///     let camera_from_board = (base_from_flange * flange_from_camera).inverse() * base_from_board;
+///     let board = BoardObservation::Pose(camera_from_board);
+///     HandEyeSample { name: format!("{tilt:?}"), base_from_flange, board, joints: None }
+/// });
+/// let calibration = calibrate_hand_eye(&HandEyeInput {
+///     setup: Setup::EyeInHand,
+///     samples: samples.into(),
+///     intrinsics: None,
+///     board_symmetries: &[],
+///     chain: None,
+///     options: HandEyeOptions::default(),
+/// })?;
+/// let difference = flange_from_camera.inverse() * calibration.parent_from_camera;
+/// assert!(difference.translation.vector.norm() < 1e-6);
+/// # Ok::<(), calibration::Error>(())
+/// ```
+pub fn calibrate_hand_eye(input: &HandEyeInput<'_>) -> Result<HandEyeCalibration, Error> {
+    check(input)?;
+    let refused = |refusal| Error::Refused(Box::new(refusal));
+    mistakes::check_magnitudes(&input.samples).map_err(refused)?;
+    let robot_poses: Vec<Transform> = input.samples.iter().map(|sample| sample.base_from_flange).collect();
+    excitation::check_rotations(&robot_poses, "flange").map_err(refused)?;
+
+    let (samples, without_board) = samples::samples(input, input.intrinsics.as_ref());
+    if samples.len() < MIN_SAMPLES {
+        return Err(refused(too_few(samples.len(), "have a usable view of the board")));
+    }
+    let consensus = consensus::find(&samples);
+    if let Some(refusal) = mistakes::explain(input.setup, &samples, consensus.as_ref()) {
+        return Err(refused(refusal));
+    }
+    let Some(consensus) = consensus else {
+        return Err(refused(Refusal::new(
+            "no hand-eye transform explains three of the samples",
+            "check that each robot pose belongs to its image, and rotate the flange more between the poses",
+        )));
+    };
+    let refined = refine::refine(input, samples, consensus)?;
+    let used: Vec<Transform> = refined.used().map(|sample| input.samples[sample.sample_ix].base_from_flange).collect();
+    excitation::check_rotations(&used, "flange").map_err(refused)?;
+    let calibration = report::report(input, &refined, &without_board)?;
+    excitation::check_uncertainty(
+        &refined.covariance,
+        &refined.solution,
+        input.options.max_sigma_m,
+        input.options.max_sigma_rad,
+        input.setup == Setup::EyeInHand,
+    )
+    .map_err(refused)?;
+    Ok(calibration)
+}
+
+fn too_few(n: usize, what: &str) -> Refusal {
+    Refusal::new(
+        format!("{n} samples {what}; at least {MIN_SAMPLES} are needed, and 10 to 20 are recommended"),
+        "add poses that rotate the flange by at least 20 degrees around different axes",
+    )
+}
+
+/// Rejects invalid values.
+fn check(input: &HandEyeInput<'_>) -> Result<(), Error> {
+    let invalid = |why: String| Err(Error::HandEyeInput { why });
+    if input.samples.len() < MIN_SAMPLES {
+        return Err(Error::Refused(Box::new(too_few(input.samples.len(), "were given"))));
+    }
+    let is_view = |sample: &HandEyeSample| matches!(sample.board, BoardObservation::View(_));
+    let n_views = input.samples.iter().filter(|sample| is_view(sample)).count();
+    if n_views != 0 && n_views != input.samples.len() {
+        return invalid(format!(
+            "{n_views} of {} samples have corners; give corners or poses for all",
+            input.samples.len()
+        ));
+    }
+    for sample in &input.samples {
+        let is_rigid = |pose: &Transform| {
+            transform::is_finite(pose) && (pose.rotation.norm() - 1.0).abs() < transform::RIGID_TOLERANCE
+        };
+        if !is_rigid(&sample.base_from_flange) {
+            return invalid(format!("sample {:?}: base_from_flange is not a finite rigid transform", sample.name));
+        }
+        match &sample.board {
+            BoardObservation::Pose(pose) if !is_rigid(pose) => {
+                return invalid(format!("sample {:?}: camera_from_board is not a finite rigid transform", sample.name));
+            }
+            BoardObservation::View(view) => {
+                let is_finite = |point: &crate::BoardPoint| {
+                    point.point_in_board.iter().chain(&point.pixel).all(|value| value.is_finite())
+                };
+                if let Some(ix) = view.points.iter().position(|point| !is_finite(point)) {
+                    return invalid(format!("sample {:?}: corner {ix} is not finite", sample.name));
+                }
+            }
+            BoardObservation::Pose(_) => (),
+        }
+    }
+    let options = &input.options;
+    let needs_corners = options.estimate_intrinsics || options.estimate_joint_offsets;
+    if needs_corners && n_views == 0 {
+        return invalid("intrinsics and joint offsets need corners, but the samples have board poses".to_owned());
+    }
+    match &input.intrinsics {
+        Some(intrinsics) => intrinsics.validate().map_err(|error| Error::HandEyeInput { why: error.to_string() })?,
+        None if n_views > 0 => return invalid("the samples have corners, but the intrinsics are missing".to_owned()),
+        None => (),
+    }
+    if options.estimate_joint_offsets {
+        let Some(chain) = input.chain else {
+            return invalid("joint offsets need the chain of the arm (a URDF)".to_owned());
+        };
+        for sample in &input.samples {
+            let joints = sample.joints.as_deref().unwrap_or_default();
+            if let Err(error) = chain.forward(joints) {
+                return invalid(format!("sample {:?}: {error}", sample.name));
+            }
+        }
+    }
+    Ok(())
+}

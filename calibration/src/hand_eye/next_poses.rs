@@ -1,0 +1,217 @@
+//! Suggests the next robot poses by information gain.
+//!
+//! Candidates keep the board in view at a distance and tilt at which it is detected well. Poses are selected greedily such
+//! that the volume of the hand-eye uncertainty shrinks most (D-optimality; Fedorov 1972, section 2.2).
+
+use super::excitation;
+use super::geometry;
+use super::pose_fit::Measurement;
+use super::report::{self, HandEyeCalibration};
+use super::{HandEyeInput, Setup};
+use kinematics::random::Random;
+use kinematics::{Intrinsics, Transform};
+use nalgebra::{DMatrix, Matrix6, Point3, Translation3, UnitQuaternion, Vector3};
+
+/// Options of [`suggest_next_poses`].
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct NextPoseOptions {
+    /// Number of poses.
+    pub n_poses: usize,
+    /// Center of the board, meters in the board frame.
+    pub center_in_board: Vector3<f64>,
+    /// Radius of a circle around the center that contains all corners, meters.
+    pub radius_m: f64,
+    /// Largest angle between the normal of the board and the viewing direction, radians.
+    pub max_tilt_rad: f64,
+}
+
+/// A suggested pose.
+#[derive(Clone, Debug, PartialEq)]
+pub struct NextPose {
+    /// Pose of the flange.
+    pub base_from_flange: Transform,
+    /// Joint values within the limits; `None` without a chain.
+    pub joints: Option<Vec<f64>>,
+    /// The motion from the closest sample, as a sentence.
+    pub motion: String,
+    /// Factor by which the standard deviations of the hand-eye transform shrink on average, 0 to 1.
+    pub sigma_frac: f64,
+}
+
+/// Suggests poses for a finished calibration. `input` must be that of the calibration.
+///
+/// With a chain and joint values, candidates are configurations near those of the samples, within the joint limits.
+/// Without, they are flange poses that rotate the camera around the board or about its own axes; the caller must check
+/// that the arm reaches them.
+pub fn suggest_next_poses(
+    input: &HandEyeInput<'_>,
+    calibration: &HandEyeCalibration,
+    options: &NextPoseOptions,
+) -> Vec<NextPose> {
+    let scene = Scene { input, calibration, options };
+    let mut information = match calibration.refined.covariance.clone().try_inverse() {
+        Some(information) => information,
+        None => return Vec::new(),
+    };
+    let candidates = scene.candidates();
+    let mut suggested = Vec::new();
+    for _ in 0..options.n_poses {
+        let Some(before) = log_volume(&information) else { break };
+        let gain = |candidate: &Candidate| {
+            let with = &information + &candidate.information;
+            log_volume(&with).map_or(0.0, |after| before - after)
+        };
+        let best = candidates.iter().map(|candidate| (gain(candidate), candidate)).max_by(|a, b| a.0.total_cmp(&b.0));
+        let Some((gain, best)) = best.filter(|(gain, _)| *gain > 0.0) else { break };
+        information += &best.information;
+        suggested.push(NextPose {
+            base_from_flange: best.base_from_flange,
+            joints: best.joints.clone(),
+            motion: scene.motion(best),
+            sigma_frac: (-gain / 12.0).exp(),
+        });
+    }
+    suggested
+}
+
+/// Logarithm of the determinant of the covariance of the hand-eye transform.
+fn log_volume(information: &DMatrix<f64>) -> Option<f64> {
+    let covariance = information.clone().cholesky()?.inverse();
+    let hand_eye: Matrix6<f64> = covariance.fixed_view::<6, 6>(0, 0).into_owned();
+    Some(2.0 * hand_eye.cholesky()?.l().diagonal().map(f64::ln).sum())
+}
+
+struct Candidate {
+    base_from_flange: Transform,
+    joints: Option<Vec<f64>>,
+    /// Index in the input of the sample it was derived from.
+    sample_ix: usize,
+    information: DMatrix<f64>,
+}
+
+struct Scene<'a> {
+    input: &'a HandEyeInput<'a>,
+    calibration: &'a HandEyeCalibration,
+    options: &'a NextPoseOptions,
+}
+
+impl Scene<'_> {
+    fn candidates(&self) -> Vec<Candidate> {
+        const TRIALS: usize = 1500;
+        let refined = &self.calibration.refined;
+        let used: Vec<usize> = refined.used().map(|sample| sample.sample_ix).collect();
+        let distances: Vec<f64> =
+            refined.measurements().iter().map(|m| m.camera_from_board.translation.vector.norm()).collect();
+        let (Some(distance_m), false) = (kinematics::quantile::median(&distances), used.is_empty()) else {
+            return Vec::new();
+        };
+        let unit_covariance = self.mean_unit_covariance();
+        let mut random = Random::new(1);
+        (0..TRIALS)
+            .filter_map(|_| {
+                let sample_ix = used[random.below(used.len())];
+                let (base_from_flange, joints) = self.moved(sample_ix, &mut random)?;
+                let a = geometry::a_of(self.input.setup, &base_from_flange);
+                let camera_from_board = refined.solution.camera_from_board(&a);
+                self.is_well_visible(&camera_from_board, distance_m).then_some(())?;
+                let measurement = Measurement { a, camera_from_board, unit_covariance };
+                let (jacobian, weight) =
+                    report::residual_information(self.input.setup, &measurement, &refined.solution, &refined.noise)?;
+                let information = DMatrix::from_fn(12, 12, |row, column| {
+                    (jacobian.column(row).transpose() * weight * jacobian.column(column))[0]
+                });
+                Some(Candidate { base_from_flange, joints, sample_ix, information })
+            })
+            .collect()
+    }
+
+    /// Mean accuracy of the board poses so far.
+    fn mean_unit_covariance(&self) -> Option<Matrix6<f64>> {
+        let measurements = self.calibration.refined.measurements();
+        let n = measurements.len() as f64;
+        measurements.iter().map(|m| m.unit_covariance).sum::<Option<Matrix6<f64>>>().map(|sum| sum / n)
+    }
+
+    /// A random pose near that of a sample.
+    fn moved(&self, sample_ix: usize, random: &mut Random) -> Option<(Transform, Option<Vec<f64>>)> {
+        const MAX_JOINT_CHANGE: f64 = 0.8;
+        const MAX_ROTATION_RAD: f64 = 0.9;
+        let sample = &self.input.samples[sample_ix];
+        if let (Some(chain), Some(joints)) = (self.input.chain, &sample.joints) {
+            let moved: Vec<f64> =
+                joints.iter().map(|joint| joint + MAX_JOINT_CHANGE * random.uniform(-1.0, 1.0)).collect();
+            let is_allowed =
+                moved.iter().zip(chain.limits()).all(|(joint, limit)| (limit.lower..=limit.upper).contains(joint));
+            let before = chain.forward(joints).ok()?;
+            let pose = chain.forward(&moved).ok()? * before.inverse() * sample.base_from_flange;
+            return is_allowed.then_some((pose, Some(moved)));
+        }
+        // Rotates the camera about the center of the board, or the board about its own center.
+        let solution = &self.calibration.refined.solution;
+        let axis = Vector3::new(random.normal(), random.normal(), random.normal()).normalize();
+        let turn = UnitQuaternion::from_scaled_axis(axis * random.uniform(0.2, MAX_ROTATION_RAD));
+        let base_from_board = match self.input.setup {
+            Setup::EyeInHand => solution.y,
+            Setup::EyeToHand => sample.base_from_flange * solution.y,
+        };
+        let center = (base_from_board * Point3::from(self.options.center_in_board)).coords;
+        let about_center = Transform::from_parts(Translation3::from(center - turn * center), turn);
+        Some((about_center * sample.base_from_flange, None))
+    }
+
+    fn is_well_visible(&self, camera_from_board: &Transform, distance_m: f64) -> bool {
+        const DISTANCES: std::ops::RangeInclusive<f64> = 0.6..=1.6; // Relative to the samples so far.
+        const MARGIN_FRAC: f64 = 0.02;
+        const HALF_VIEW_RAD: f64 = 0.35; // Without intrinsics: the field of view of a narrow camera.
+        let center = (camera_from_board * Point3::from(self.options.center_in_board)).coords;
+        let normal = camera_from_board.rotation * Vector3::z();
+        let tilt_cosine = normal.dot(&center.normalize()).abs();
+        if center.z.is_nan()
+            || center.z <= 0.0
+            || !DISTANCES.contains(&(camera_from_board.translation.vector.norm() / distance_m))
+        {
+            return false;
+        }
+        if tilt_cosine < self.options.max_tilt_rad.cos() {
+            return false;
+        }
+        let rim = (0..8).map(|step| {
+            let (sine, cosine) = (f64::from(step) * std::f64::consts::FRAC_PI_4).sin_cos();
+            let point = self.options.center_in_board + Vector3::new(cosine, sine, 0.0) * self.options.radius_m;
+            (camera_from_board * Point3::from(point)).coords
+        });
+        let is_inside = |intrinsics: &Intrinsics, point: &Vector3<f64>| {
+            intrinsics.project(point).is_some_and(|pixel| {
+                (0..2).all(|axis| {
+                    let size = f64::from(intrinsics.size_px[axis]);
+                    pixel[axis] > MARGIN_FRAC * size && pixel[axis] < (1.0 - MARGIN_FRAC) * size
+                })
+            })
+        };
+        match &self.calibration.refined.intrinsics {
+            Some(intrinsics) => rim.into_iter().all(|point| is_inside(intrinsics, &point)),
+            None => rim.into_iter().all(|point| point.z > 0.0 && point.xy().norm() < HALF_VIEW_RAD.tan() * point.z),
+        }
+    }
+
+    fn motion(&self, candidate: &Candidate) -> String {
+        let sample = &self.input.samples[candidate.sample_ix];
+        let old_from_new = sample.base_from_flange.inverse() * candidate.base_from_flange;
+        // The same rotation in camera axes (eye in hand).
+        let x = &self.calibration.refined.solution.x;
+        let (rotation, body) = match self.input.setup {
+            Setup::EyeInHand => (x.inverse() * old_from_new * x, "camera"),
+            Setup::EyeToHand => (old_from_new, "flange"),
+        };
+        let vector = rotation.rotation.scaled_axis();
+        let angle_deg = vector.norm().to_degrees();
+        let axis = if vector.norm() > 0.0 { vector.normalize() } else { Vector3::z() };
+        let signed_deg = angle_deg * axis[axis.iamax()].signum();
+        let name = excitation::axis_name(&axis, body);
+        format!(
+            "from the pose of {:?}, rotate the flange by {signed_deg:.0} degrees around {name} and move it by {:.0} mm",
+            sample.name,
+            1e3 * old_from_new.translation.vector.norm()
+        )
+    }
+}

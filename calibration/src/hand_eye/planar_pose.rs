@@ -1,0 +1,397 @@
+//! Pose of a planar board from its corners in one image, with both solutions of the two-fold ambiguity.
+//!
+//! The initial poses follow from the homography at the center of the board (Collins and Bartoli 2014, "Infinitesimal
+//! plane-based pose estimation", section 4.3). Both are refined by minimizing the reprojection error.
+
+use super::closed_form::nearest_rotation;
+use crate::least_squares::{self, BlockSums, Loss};
+use crate::{BoardPoint, BoardView};
+use kinematics::random::Random;
+use kinematics::{Intrinsics, Transform};
+use nalgebra::{
+    DMatrix, DVector, Matrix2, Matrix2x3, Matrix3, Matrix6, Rotation3, UnitQuaternion, Vector2, Vector3, Vector6,
+};
+
+/// Minimum number of corners for a pose.
+pub(super) const MIN_CORNERS: usize = 4;
+
+/// Threshold of the robust loss, pixels. Corners of sharp images are accurate to a tenth of a pixel.
+const LOSS_THRESHOLD_PX: f64 = 1.0;
+
+/// A pose of the board and its quality.
+#[derive(Clone, Debug)]
+pub(super) struct BoardPose {
+    pub(super) camera_from_board: Transform,
+    /// Information about a small rotation (in camera axes) and translation of the board for corners with an error of
+    /// one pixel: see [`moved`].
+    pub(super) information: Matrix6<f64>,
+    /// Sum of the squared residuals of the inliers, square pixels.
+    pub(super) squares_px2: f64,
+    /// Per corner: whether its residual fits those of the others.
+    pub(super) is_inlier: Vec<bool>,
+}
+
+impl BoardPose {
+    pub(super) fn n_inliers(&self) -> usize {
+        self.is_inlier.iter().filter(|is_inlier| **is_inlier).count()
+    }
+}
+
+/// A pose after a small rotation about the origin of the board, in camera axes, and a translation in camera axes.
+pub(super) fn moved(pose: &Transform, step: &Vector6<f64>) -> Transform {
+    let rotation = UnitQuaternion::from_scaled_axis(step.fixed_rows::<3>(0).into_owned());
+    Transform::from_parts((pose.translation.vector + step.fixed_rows::<3>(3)).into(), rotation * pose.rotation)
+}
+
+/// The poses that explain the corners, best first: one or two. Empty if the corners do not determine a pose.
+pub(super) fn board_poses(view: &BoardView, intrinsics: &Intrinsics) -> Vec<BoardPose> {
+    let rays: Option<Vec<Vector2<f64>>> =
+        view.points.iter().map(|point| intrinsics.unproject(point.pixel).map(|ray| ray.xy())).collect();
+    let Some(rays) = rays else { return Vec::new() };
+    let Some(plane) = Plane::new(&view.points) else { return Vec::new() };
+    let all = vec![true; view.points.len()];
+    let attempt = |is_inlier: &[bool]| -> Vec<BoardPose> {
+        let Some(homography) = homography(&plane.points, &rays, is_inlier) else { return Vec::new() };
+        let mut poses: Vec<BoardPose> = initial_rotations(&homography)
+            .into_iter()
+            .filter_map(|rotation| {
+                let camera_from_plane = with_translation(rotation, &plane.points, &rays, is_inlier)?;
+                refine(camera_from_plane * plane.plane_from_board, view, intrinsics, is_inlier)
+            })
+            .collect();
+        poses.sort_by(|a, b| a.squares_px2.total_cmp(&b.squares_px2));
+        poses
+    };
+    let mut poses = attempt(&all);
+    let has_outliers = poses.first().is_none_or(|best| best.n_inliers() < view.points.len());
+    if has_outliers && let Some(consensus) = consensus_corners(&plane.points, &rays, intrinsics) {
+        let robust = attempt(&consensus);
+        let n_inliers = |poses: &[BoardPose]| poses.first().map_or(0, BoardPose::n_inliers);
+        if n_inliers(&robust) >= n_inliers(&poses) {
+            poses = robust;
+        }
+    }
+    if poses.len() == 2 && is_same(&poses[0].camera_from_board, &poses[1].camera_from_board) {
+        poses.truncate(1);
+    }
+    poses
+}
+
+/// Whether two poses are the same solution.
+fn is_same(a: &Transform, b: &Transform) -> bool {
+    const SAME_RAD: f64 = 1e-4;
+    a.rotation.angle_to(&b.rotation) < SAME_RAD
+}
+
+/// Board points in the coordinates of their plane, with the centroid as origin.
+struct Plane {
+    plane_from_board: Transform,
+    points: Vec<Vector2<f64>>,
+}
+
+impl Plane {
+    /// `None` if the points are too few or on a line.
+    fn new(points: &[BoardPoint]) -> Option<Self> {
+        const MIN_WIDTH_RATIO: f64 = 1e-3;
+        (points.len() >= MIN_CORNERS).then_some(())?;
+        let centroid = points.iter().map(|point| point.point_in_board).sum::<Vector3<f64>>() / points.len() as f64;
+        let spread: Matrix3<f64> = points
+            .iter()
+            .map(|point| (point.point_in_board - centroid) * (point.point_in_board - centroid).transpose())
+            .sum();
+        if !spread.iter().all(|value| value.is_finite()) {
+            return None;
+        }
+        let eigen = spread.symmetric_eigen();
+        let mut order = [0, 1, 2];
+        order.sort_by(|&i, &j| eigen.eigenvalues[j].total_cmp(&eigen.eigenvalues[i]));
+        let [first, second, _] = order;
+        (eigen.eigenvalues[second] > MIN_WIDTH_RATIO.powi(2) * eigen.eigenvalues[first]).then_some(())?;
+        let (x, y) = (eigen.eigenvectors.column(first).into_owned(), eigen.eigenvectors.column(second).into_owned());
+        let axes = Matrix3::from_rows(&[x.transpose(), y.transpose(), x.cross(&y).transpose()]);
+        let rotation = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(axes));
+        let plane_from_board = Transform::from_parts((rotation * -centroid).into(), rotation);
+        let in_plane =
+            |point: &BoardPoint| (plane_from_board * nalgebra::Point3::from(point.point_in_board)).coords.xy();
+        Some(Self { plane_from_board, points: points.iter().map(in_plane).collect() })
+    }
+}
+
+/// Homography from the plane to the plane `z = 1` of the camera, by the normalized linear method (Hartley and Zisserman
+/// 2004, section 4.4), scaled such that the last element is 1. `None` if it is not determined.
+fn homography(points: &[Vector2<f64>], rays: &[Vector2<f64>], is_used: &[bool]) -> Option<Matrix3<f64>> {
+    let used: Vec<(Vector2<f64>, Vector2<f64>)> =
+        points.iter().zip(rays).zip(is_used).filter(|(_, used)| **used).map(|((p, r), _)| (*p, *r)).collect();
+    (used.len() >= MIN_CORNERS).then_some(())?;
+    let (from, to) = (normalization(used.iter().map(|pair| pair.0))?, normalization(used.iter().map(|pair| pair.1))?);
+    let mut rows = DMatrix::zeros((2 * used.len()).max(9), 9);
+    for (ix, (point, ray)) in used.iter().enumerate() {
+        let p = from * point.push(1.0);
+        let r = to * ray.push(1.0);
+        for axis in 0..2 {
+            for column in 0..3 {
+                rows[(2 * ix + axis, 3 * axis + column)] = p[column];
+                rows[(2 * ix + axis, 6 + column)] = -r[axis] * p[column];
+            }
+        }
+    }
+    let eigen = (rows.transpose() * rows).symmetric_eigen();
+    let smallest = eigen.eigenvalues.imin();
+    let h = eigen.eigenvectors.column(smallest);
+    let normalized = Matrix3::new(h[0], h[1], h[2], h[3], h[4], h[5], h[6], h[7], h[8]);
+    let matrix = to.try_inverse()? * normalized * from;
+    let scaled = matrix / matrix[(2, 2)];
+    scaled.iter().all(|value| value.is_finite()).then_some(scaled)
+}
+
+/// Moves the centroid to the origin and scales the mean distance from it to the square root of 2.
+fn normalization(points: impl Iterator<Item = Vector2<f64>> + Clone) -> Option<Matrix3<f64>> {
+    let n = points.clone().count() as f64;
+    let centroid = points.clone().sum::<Vector2<f64>>() / n;
+    let mean = points.map(|point| (point - centroid).norm()).sum::<f64>() / n;
+    let scale = std::f64::consts::SQRT_2 / mean;
+    scale
+        .is_finite()
+        .then(|| Matrix3::new(scale, 0.0, -scale * centroid.x, 0.0, scale, -scale * centroid.y, 0.0, 0.0, 1.0))
+}
+
+/// Both rotations that the homography allows at the origin of the plane.
+fn initial_rotations(homography: &Matrix3<f64>) -> Vec<UnitQuaternion<f64>> {
+    let h = homography;
+    let v = Vector2::new(h[(0, 2)], h[(1, 2)]);
+    let jacobian = Matrix2::new(
+        h[(0, 0)] - h[(2, 0)] * v.x,
+        h[(0, 1)] - h[(2, 1)] * v.x,
+        h[(1, 0)] - h[(2, 0)] * v.y,
+        h[(1, 1)] - h[(2, 1)] * v.y,
+    );
+    let to_ray = Rotation3::rotation_between(&Vector3::z(), &v.push(1.0)).unwrap_or_else(Rotation3::identity);
+    let projection = Matrix2x3::new(1.0, 0.0, -v.x, 0.0, 1.0, -v.y) * to_ray.matrix();
+    let Some(inverse) = projection.fixed_view::<2, 2>(0, 0).try_inverse() else { return Vec::new() };
+    let scaled = inverse * jacobian;
+    let largest = scaled.singular_values().max();
+    if largest.is_nan() || largest <= 0.0 {
+        return Vec::new();
+    }
+    let upper = scaled / largest;
+    let rest = Matrix2::identity() - upper.transpose() * upper;
+    let (b0, b1) = (rest[(0, 0)].max(0.0).sqrt(), rest[(1, 1)].max(0.0).sqrt() * rest[(0, 1)].signum());
+    [1.0, -1.0]
+        .into_iter()
+        .filter_map(|sign| {
+            let x = Vector3::new(upper[(0, 0)], upper[(1, 0)], sign * b0);
+            let y = Vector3::new(upper[(0, 1)], upper[(1, 1)], sign * b1);
+            let rotation = to_ray.matrix() * Matrix3::from_columns(&[x, y, x.cross(&y)]);
+            nearest_rotation(&rotation)
+        })
+        .collect()
+}
+
+/// Adds the translation with the least squared algebraic error. `None` if it places the board behind the camera.
+fn with_translation(
+    rotation: UnitQuaternion<f64>,
+    points: &[Vector2<f64>],
+    rays: &[Vector2<f64>],
+    is_used: &[bool],
+) -> Option<Transform> {
+    let (mut normal, mut right) = (Matrix3::zeros(), Vector3::zeros());
+    for ((point, ray), _) in points.iter().zip(rays).zip(is_used).filter(|(_, used)| **used) {
+        let rotated = rotation * point.push(0.0);
+        let rows = Matrix2x3::new(1.0, 0.0, -ray.x, 0.0, 1.0, -ray.y);
+        normal += rows.transpose() * rows;
+        right -= rows.transpose() * (rows * rotated);
+    }
+    let translation = normal.cholesky()?.solve(&right);
+    (translation.z > 0.0).then(|| Transform::from_parts(translation.into(), rotation))
+}
+
+/// Minimization of the reprojection error over the pose of one board.
+struct Reprojection<'a> {
+    points: Vec<&'a BoardPoint>,
+    intrinsics: &'a Intrinsics,
+    distance_m: f64,
+}
+
+impl least_squares::Problem for Reprojection<'_> {
+    type State = Transform;
+
+    fn scales(&self) -> DVector<f64> {
+        DVector::from_fn(6, |ix, _| if ix < 3 { 1.0 } else { self.distance_m })
+    }
+
+    fn n_blocks(&self) -> usize {
+        1
+    }
+
+    fn n_local(&self, _block_ix: usize) -> usize {
+        0
+    }
+
+    fn evaluate(&self, pose: &Transform, _block_ix: usize, sums: &mut BlockSums) -> Option<()> {
+        for point in &self.points {
+            let (residual, rows) = residual(pose, point, self.intrinsics)?;
+            sums.add(residual, [rows[0].as_slice(), rows[1].as_slice()]);
+        }
+        Some(())
+    }
+
+    fn moved(&self, pose: &Transform, shared: &DVector<f64>, _local: &[DVector<f64>]) -> Transform {
+        moved(pose, &shared.fixed_rows::<6>(0).into_owned())
+    }
+}
+
+/// Reprojection error in pixels and its derivatives with respect to the step of [`moved`], one array per component.
+fn residual(pose: &Transform, point: &BoardPoint, intrinsics: &Intrinsics) -> Option<([f64; 2], [[f64; 6]; 2])> {
+    let rotated = pose.rotation * point.point_in_board;
+    let (pixel, by_point) = intrinsics.project_with_jacobian(&(rotated + pose.translation.vector))?;
+    let by_rotation = -by_point * rotated.cross_matrix();
+    let row =
+        |axis: usize| std::array::from_fn(|ix| if ix < 3 { by_rotation[(axis, ix)] } else { by_point[(axis, ix - 3)] });
+    Some(([pixel[0] - point.pixel[0], pixel[1] - point.pixel[1]], [row(0), row(1)]))
+}
+
+fn refine(initial: Transform, view: &BoardView, intrinsics: &Intrinsics, is_used: &[bool]) -> Option<BoardPose> {
+    let used = view.points.iter().zip(is_used).filter(|(_, used)| **used).map(|(point, _)| point);
+    let problem = Reprojection { points: used.collect(), intrinsics, distance_m: initial.translation.vector.norm() };
+    let options = least_squares::Options {
+        loss: Loss::Huber { threshold: LOSS_THRESHOLD_PX },
+        max_steps: 50,
+        ..least_squares::Options::default()
+    };
+    let pose = least_squares::minimize(&problem, initial, &options).ok()?.state;
+    let errors: Vec<f64> = view
+        .points
+        .iter()
+        .map(|point| residual(&pose, point, intrinsics).map_or(f64::INFINITY, |(error, _)| error[0].hypot(error[1])))
+        .collect();
+    let limit = inlier_limit(&errors);
+    let is_inlier: Vec<bool> = errors.iter().map(|error| *error <= limit).collect();
+    let mut information = Matrix6::zeros();
+    let mut squares_px2 = 0.0;
+    for ((point, error), _) in view.points.iter().zip(&errors).zip(&is_inlier).filter(|(_, is_inlier)| **is_inlier) {
+        let (_, rows) = residual(&pose, point, intrinsics)?;
+        for row in rows {
+            let row = Vector6::from(row);
+            information += row * row.transpose();
+        }
+        squares_px2 += error * error;
+    }
+    information.cholesky()?;
+    Some(BoardPose { camera_from_board: pose, information, squares_px2, is_inlier })
+}
+
+/// The pose after one Gauss-Newton step from `predicted`, and the covariance of the step for corners with an error of one
+/// pixel. For a board that faces the camera, a pose near the true one describes the corners better than the best one,
+/// because small tilts change the corners only in second order.
+pub(super) fn stepped(
+    predicted: &Transform,
+    points: &[BoardPoint],
+    intrinsics: &Intrinsics,
+) -> Option<(Transform, Matrix6<f64>)> {
+    let (mut information, mut gradient) = (Matrix6::zeros(), Vector6::zeros());
+    for point in points {
+        let (error, rows) = residual(predicted, point, intrinsics)?;
+        for (value, row) in error.into_iter().zip(rows) {
+            let row = Vector6::from(row);
+            information += row * row.transpose();
+            gradient += row * value;
+        }
+    }
+    let covariance = information.try_inverse()?;
+    Some((moved(predicted, &-(covariance * gradient)), covariance))
+}
+
+/// Largest residual that fits the others.
+fn inlier_limit(errors: &[f64]) -> f64 {
+    /// Median of the norm of two normal numbers with deviation 1.
+    const MEDIAN_OF_NORM: f64 = 1.1774;
+    /// One in 20 000 corners without a mistake exceeds it.
+    const DEVIATIONS: f64 = 4.5;
+    const MIN_PX: f64 = 0.5;
+    let median = kinematics::quantile::median(errors).unwrap_or(0.0);
+    (DEVIATIONS * median / MEDIAN_OF_NORM).max(MIN_PX)
+}
+
+/// The largest set of corners found that agrees with a homography of four of them (Fischler and Bolles 1981). `None` if
+/// it has fewer than half of the corners.
+fn consensus_corners(points: &[Vector2<f64>], rays: &[Vector2<f64>], intrinsics: &Intrinsics) -> Option<Vec<bool>> {
+    const TRIALS: usize = 150; // Finds four good corners with 99.99 % probability if half of them are wrong.
+    const ALLOWED_PX: f64 = 3.0;
+    let n = points.len();
+    let allowed = ALLOWED_PX / intrinsics.focal_px[0];
+    let mut random = Random::new(1);
+    let mut order: Vec<usize> = (0..n).collect();
+    let mut best: Vec<bool> = Vec::new();
+    let count = |set: &[bool]| set.iter().filter(|is_in| **is_in).count();
+    for _ in 0..TRIALS {
+        random.shuffle(&mut order);
+        let mut is_used = vec![false; n];
+        order[..MIN_CORNERS].iter().for_each(|&ix| is_used[ix] = true);
+        let Some(matrix) = homography(points, rays, &is_used) else { continue };
+        let agrees = |(point, ray): (&Vector2<f64>, &Vector2<f64>)| {
+            let image = matrix * point.push(1.0);
+            image.z > 0.0 && (image.xy() / image.z - ray).norm() < allowed
+        };
+        let set: Vec<bool> = points.iter().zip(rays).map(agrees).collect();
+        if count(&set) > count(&best) {
+            best = set;
+        }
+    }
+    (count(&best) >= MIN_CORNERS.max(n.div_ceil(2))).then_some(best)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::scene;
+    use super::*;
+
+    #[test]
+    fn exact_corners_give_exact_pose() {
+        let intrinsics = scene::intrinsics();
+        for rotation in [[0.4, -0.3, 0.2], [3.0, 0.2, -0.4], [-0.2, 0.7, 1.5]] {
+            let pose = Transform::new(Vector3::new(-0.05, 0.02, 0.6), rotation.into());
+            let view = scene::view(&pose, 0.0, &mut Random::new(1));
+            let found = &board_poses(&view, &intrinsics)[0];
+            assert!((found.camera_from_board.translation.vector - pose.translation.vector).norm() < 1e-8);
+            assert!(found.camera_from_board.rotation.angle_to(&pose.rotation) < 1e-7);
+        }
+    }
+
+    #[test]
+    fn distant_board_has_two_solutions_and_the_true_one_is_among_them() {
+        let intrinsics = scene::intrinsics();
+        let pose = Transform::new(Vector3::new(0.1, 0.05, 4.0), Vector3::new(0.3, 0.2, 0.1));
+        let view = scene::view(&pose, 0.1, &mut Random::new(2));
+        let found = board_poses(&view, &intrinsics);
+        assert_eq!(found.len(), 2);
+        let closest = found.iter().map(|found| found.camera_from_board.rotation.angle_to(&pose.rotation));
+        assert!(closest.fold(f64::INFINITY, f64::min) < 0.1);
+        assert!(found[0].camera_from_board.rotation.angle_to(&found[1].camera_from_board.rotation) > 0.2);
+    }
+
+    #[test]
+    fn wrong_corners_are_excluded() {
+        let intrinsics = scene::intrinsics();
+        let pose = Transform::new(Vector3::new(-0.05, 0.02, 0.6), Vector3::new(0.4, -0.3, 0.2));
+        let mut random = Random::new(5);
+        let mut view = scene::view(&pose, 0.1, &mut random);
+        for point in view.points.iter_mut().step_by(3) {
+            point.pixel = [random.uniform(0.0, 1280.0), random.uniform(0.0, 720.0)];
+        }
+        let found = &board_poses(&view, &intrinsics)[0];
+        assert!((found.camera_from_board.translation.vector - pose.translation.vector).norm() < 1e-3);
+        assert!(found.is_inlier.iter().step_by(3).all(|is_inlier| !is_inlier));
+    }
+
+    #[test]
+    fn corners_on_a_line_and_too_few_corners_give_no_pose() {
+        let intrinsics = scene::intrinsics();
+        let pose = Transform::new(Vector3::new(-0.05, 0.02, 0.6), Vector3::new(0.4, -0.3, 0.2));
+        let mut view = scene::view(&pose, 0.0, &mut Random::new(1));
+        let mut line = view.clone();
+        line.points.retain(|point| point.point_in_board.y == 0.0);
+        assert!(board_poses(&line, &intrinsics).is_empty());
+        view.points.truncate(3);
+        assert!(board_poses(&view, &intrinsics).is_empty());
+    }
+}

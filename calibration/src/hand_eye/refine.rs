@@ -1,0 +1,482 @@
+//! Refinement of the initial solution: outliers, noise and, with corners, the reprojection error.
+
+use super::closed_form::ClosedForm;
+use super::consensus::{self, Consensus};
+use super::corner_fit::{self, CornerProblem, CornerState, View};
+use super::evaluation;
+use super::geometry::{self, N_PARAMS, Solution};
+use super::planar_pose;
+use super::pose_fit::{self, HandEyeNoise, Measurement, PoseFit};
+use super::samples::{self, Sample};
+use super::{BoardObservation, HandEyeInput, MIN_SAMPLES, Refusal};
+use crate::least_squares::Fit;
+use crate::{BoardPoint, Error};
+use kinematics::{Intrinsics, Transform};
+use nalgebra::{DMatrix, DVector, Vector6};
+
+/// Result of [`refine`].
+#[derive(Clone, Debug)]
+pub(super) struct Refined {
+    pub(super) solution: Solution,
+    pub(super) noise: HandEyeNoise,
+    /// Noise that determines the weights of the fit.
+    pub(super) weighting: HandEyeNoise,
+    /// Covariance of the parameters of [`Solution::moved`], enlarged for the uncertainty of the noise.
+    pub(super) covariance: DMatrix<f64>,
+    /// All samples with a board pose, and the candidate of each.
+    pub(super) samples: Vec<Sample>,
+    pub(super) choice: Vec<usize>,
+    pub(super) is_inlier: Vec<bool>,
+    /// Per sample: squared Mahalanobis distance, six degrees of freedom.
+    pub(super) squared_distances: Vec<f64>,
+    pub(super) closed_form: ClosedForm,
+    /// Intrinsics that were used or estimated.
+    pub(super) intrinsics: Option<Intrinsics>,
+    pub(super) intrinsics_sigma: Vec<f64>,
+    /// Offsets of the inner joints and their standard deviations.
+    pub(super) joint_offsets: Vec<(f64, f64)>,
+    pub(super) warnings: Vec<String>,
+}
+
+impl Refined {
+    /// Samples that agree with the solution.
+    pub(super) fn used(&self) -> impl Iterator<Item = &Sample> {
+        self.samples.iter().zip(&self.is_inlier).filter(|(_, is_inlier)| **is_inlier).map(|(sample, _)| sample)
+    }
+
+    /// Measurements of the samples that agree.
+    pub(super) fn measurements(&self) -> Vec<Measurement> {
+        select(&pose_fit::measurements(&self.samples, &self.choice), &self.is_inlier)
+    }
+}
+
+/// Refines a consensus.
+///
+/// # Errors
+/// [`Error::Refused`] if fewer than three samples, or less than half of them, agree.
+pub(super) fn refine(
+    input: &HandEyeInput<'_>,
+    mut samples: Vec<Sample>,
+    consensus: Consensus,
+) -> Result<Refined, Error> {
+    let is_inlier = consensus.is_inlier();
+    let mut choice = consensus.choice;
+    let chosen = select(&pose_fit::measurements(&samples, &choice), &is_inlier);
+    let (closed_form, initial) = best_closed_form(&chosen, consensus.solution);
+    let corner_px = corner_noise(&samples, &choice, &is_inlier);
+    let noise = pose_fit::initial_noise(&chosen, &initial, corner_px);
+    let mut stage = reject_and_fit(input, &samples, &mut choice, is_inlier, initial, noise)?;
+
+    let Some(given) = input.intrinsics.clone().filter(|_| corner_px.is_some()) else {
+        return Ok(finish(samples, choice, stage, closed_form, input.intrinsics.clone()));
+    };
+    relinearize(input, &mut samples, &choice, &stage, &given);
+    let (solution, noise) = (stage.fit.solution, stage.fit.noise);
+    stage = reject_and_fit(input, &samples, &mut choice, stage.is_inlier, solution, noise)?;
+
+    let is_free = input.options.estimate_intrinsics || input.options.estimate_joint_offsets;
+    if !is_free {
+        let doubt =
+            IntrinsicsDoubt::new(Selection { input, samples: &samples, choice: &choice, stage: &stage }, &given);
+        (stage.fit, stage.weighting) =
+            choose_weights(Selection { input, samples: &samples, choice: &choice, stage: &stage }, &given)?;
+        stage.fit.solution =
+            minimize_corners(Selection { input, samples: &samples, choice: &choice, stage: &stage }, &given)?;
+        if let Some(doubt) = &doubt {
+            stage.fit.covariance += doubt.covariance(&stage.fit.solution);
+        }
+        let mut refined = finish(samples, choice, stage, closed_form, Some(given));
+        refined.warnings.extend(doubt.map(|doubt| doubt.warning));
+        return Ok(refined);
+    }
+    let free = minimize_free(input, &mut samples, &mut choice, &mut stage, given)?;
+    let corrected = with_offsets(input, &free.state.joint_offsets);
+    let intrinsics = free.state.intrinsics.clone();
+    (stage.fit, stage.weighting) = choose_weights(
+        Selection { input: &corrected, samples: &samples, choice: &choice, stage: &stage },
+        &intrinsics,
+    )?;
+    stage.fit.solution = minimize_corners(
+        Selection { input: &corrected, samples: &samples, choice: &choice, stage: &stage },
+        &intrinsics,
+    )?;
+    stage.fit.covariance += free.covariance.view((0, 0), (N_PARAMS, N_PARAMS));
+    let n_intrinsics = if input.options.estimate_intrinsics { intrinsics.params().len() } else { 0 };
+    let mut refined = finish(samples, choice, stage, closed_form, Some(intrinsics));
+    refined.intrinsics_sigma = (0..n_intrinsics).map(|ix| free.sigma(N_PARAMS + ix)).collect();
+    let offsets = free.state.joint_offsets.iter().enumerate();
+    refined.joint_offsets = offsets.map(|(ix, offset)| (*offset, free.sigma(N_PARAMS + n_intrinsics + ix))).collect();
+    Ok(refined)
+}
+
+/// Estimates intrinsics and joint offsets. The variances depend on the poses of the board, and those on the intrinsics.
+fn minimize_free(
+    input: &HandEyeInput<'_>,
+    samples: &mut Vec<Sample>,
+    choice: &mut Vec<usize>,
+    stage: &mut Stage,
+    given: Intrinsics,
+) -> Result<Fit<CornerState>, Error> {
+    const ROUNDS: usize = 3;
+    let (mut intrinsics, mut offsets) = (given, Vec::new());
+    for round in 0.. {
+        let free = Free { intrinsics: input.options.estimate_intrinsics, joints: input.options.estimate_joint_offsets };
+        let fit = corner_fit(Selection { input, samples, choice, stage }, &intrinsics, &offsets, free)?;
+        stage.fit.solution = fit.state.solution;
+        intrinsics = fit.state.intrinsics.clone();
+        offsets.clone_from(&fit.state.joint_offsets);
+        let corrected = with_offsets(input, &offsets);
+        let usable = samples::samples(&corrected, Some(&intrinsics)).0;
+        if usable.len() != samples.len() {
+            return Err(Error::Refused(Box::new(Refusal::new(
+                "with the estimated intrinsics, some images have no board pose",
+                "keep the intrinsics fixed, or add images in which the board covers the corners of the image",
+            ))));
+        }
+        *samples = usable;
+        *choice = consensus::choose(samples, &stage.fit.solution);
+        let noise = HandEyeNoise { residual_px: corner_noise(samples, choice, &stage.is_inlier), ..stage.fit.noise };
+        *stage = reject_and_fit(&corrected, samples, choice, stage.is_inlier.clone(), stage.fit.solution, noise)?;
+        relinearize(&corrected, samples, choice, stage, &intrinsics);
+        if round + 1 == ROUNDS {
+            return Ok(fit);
+        }
+    }
+    unreachable!("the loop returns in its last round")
+}
+
+/// Minimizes the reprojection error with the chosen noise model.
+fn minimize_corners(selection: Selection<'_>, intrinsics: &Intrinsics) -> Result<Solution, Error> {
+    let fixed = Free { intrinsics: false, joints: false };
+    Ok(corner_fit(selection, intrinsics, &[], fixed)?.state.solution)
+}
+
+/// The corners contradict the given intrinsics.
+struct IntrinsicsDoubt {
+    free: Solution,
+    free_covariance: DMatrix<f64>,
+    warning: String,
+}
+
+impl IntrinsicsDoubt {
+    /// `None` if free intrinsics do not fit significantly better.
+    fn new(selection: Selection<'_>, intrinsics: &Intrinsics) -> Option<Self> {
+        let fit = |is_free: bool| {
+            let free = Free { intrinsics: is_free, joints: false };
+            corner_fit(selection, intrinsics, &[], free).ok()
+        };
+        let (fixed, free) = (fit(false)?, fit(true)?);
+        // Twice the decrease of the cost has as many degrees of freedom as there are intrinsics. Residuals of real
+        // images are not independent, so their variance scales it, and the limit is generous.
+        let n_params = intrinsics.params().len() as f64;
+        let decrease = 2.0 * (fixed.cost - free.cost) / free.variance.max(1.0);
+        (decrease > n_params + 6.0 * (2.0 * n_params).sqrt()).then_some(())?;
+        let change = fixed.state.solution.x.inverse() * free.state.solution.x;
+        let warning = format!(
+            "the corners contradict the given intrinsics: with free intrinsics, the focal length changes from {:.1} to {:.1} px, and the camera moves by {:.1} mm and {:.2} degrees, which is included in the uncertainty; calibrate the intrinsics, or estimate them here",
+            intrinsics.focal_px[0],
+            free.state.intrinsics.focal_px[0],
+            1e3 * change.translation.vector.norm(),
+            change.rotation.angle().to_degrees()
+        );
+        let free_covariance = free.covariance.view((0, 0), (N_PARAMS, N_PARAMS)).into_owned();
+        Some(Self { free: free.state.solution, free_covariance, warning })
+    }
+
+    /// Covariance to add to that of a solution with the given intrinsics: that of free intrinsics, and the square of the
+    /// difference.
+    fn covariance(&self, solution: &Solution) -> DMatrix<f64> {
+        let mut shift = DVector::zeros(N_PARAMS);
+        for (first, from, to) in [(0, solution.x, self.free.x), (6, solution.y, self.free.y)] {
+            let change = from.inverse() * to;
+            shift.fixed_rows_mut::<3>(first).copy_from(&change.rotation.scaled_axis());
+            shift.fixed_rows_mut::<3>(first + 3).copy_from(&change.translation.vector);
+        }
+        &self.free_covariance + &shift * shift.transpose()
+    }
+}
+
+/// Replaces the poses of the samples by steps from the predicted ones.
+fn relinearize(
+    input: &HandEyeInput<'_>,
+    samples: &mut [Sample],
+    choice: &[usize],
+    stage: &Stage,
+    intrinsics: &Intrinsics,
+) {
+    /// Beyond, the step may not be accurate.
+    const MAX_SQUARED_DISTANCE: f64 = 100.0;
+    for ix in 0..samples.len() {
+        if stage.squared_distances[ix] > MAX_SQUARED_DISTANCE {
+            continue;
+        }
+        let points = corners(input, &samples[ix], choice[ix]);
+        let predicted = predicted(&stage.fit.solution, &samples[ix]);
+        let candidate = &mut samples[ix].candidates[choice[ix]];
+        if let (Some((pose, covariance)), Some(corners)) =
+            (planar_pose::stepped(&predicted, &points, intrinsics), &mut candidate.corners)
+        {
+            candidate.camera_from_board = pose;
+            corners.unit_covariance = covariance;
+        }
+    }
+}
+
+/// Chooses how far the weights allow for errors of the robot.
+///
+/// Errors of the lens model that are common to all images look like errors of the robot. Then smaller robot errors
+/// predict held-out images better; without any, the fit minimizes the reprojection error. The alternatives are compared
+/// by the product of three held-out errors, which does not depend on units: reprojection, position of the board, and its
+/// rotation. The covariance follows from the estimated noise in all cases.
+fn choose_weights(selection: Selection<'_>, intrinsics: &Intrinsics) -> Result<(PoseFit, HandEyeNoise), Error> {
+    const FACTORS: [f64; 5] = [1.0, 0.5, 0.25, 0.1, 0.0];
+    let Selection { input, samples, choice, stage } = selection;
+    let estimated = &stage.fit;
+    let measurements = select(&pose_fit::measurements(samples, choice), &stage.is_inlier);
+    let used: Vec<(&Sample, usize)> = samples
+        .iter()
+        .zip(choice)
+        .zip(&stage.is_inlier)
+        .filter(|(_, is_inlier)| **is_inlier)
+        .map(|((sample, choice), _)| (sample, *choice))
+        .collect();
+    let held_out_error = |weighting: HandEyeNoise| -> Option<f64> {
+        let folds = evaluation::leave_one_out(input.setup, &measurements, estimated.solution, weighting, true);
+        let folds: Vec<Solution> = folds.into_iter().collect::<Option<_>>()?;
+        let squares_px2 = used.iter().zip(&folds).map(|((sample, choice), solution)| {
+            let points = corners(input, sample, *choice);
+            evaluation::reprojection_squares(&predicted(solution, sample), &points, intrinsics)
+        });
+        let boards: Vec<Transform> =
+            folds.iter().zip(&measurements).map(|(solution, m)| board_in_parent(solution, m)).collect();
+        let scatter = evaluation::scatter(&boards)?;
+        Some(squares_px2.sum::<f64>().sqrt() * scatter.mm * scatter.deg)
+    };
+    let best = FACTORS
+        .into_iter()
+        .map(|factor| estimated.noise.with_robot_errors(factor))
+        .filter_map(|weighting| Some((held_out_error(weighting)?, weighting)))
+        .min_by(|a, b| a.0.total_cmp(&b.0));
+    let Some((_, weighting)) = best else { return Ok((estimated.clone(), estimated.noise)) };
+    let solution = pose_fit::fit_with_known_noise(input.setup, &measurements, estimated.solution, weighting)?.solution;
+    let covariance = pose_fit::sandwich_covariance(input.setup, &measurements, &solution, &weighting, &estimated.noise)
+        .unwrap_or_else(|| estimated.covariance.clone());
+    Ok((PoseFit { solution, covariance, ..*estimated }, weighting))
+}
+
+/// The input with corrected joints applied to the robot poses.
+fn with_offsets<'a>(input: &HandEyeInput<'a>, offsets: &[f64]) -> HandEyeInput<'a> {
+    let mut corrected = input.clone();
+    let Some(chain) = input.chain.filter(|_| !offsets.is_empty()) else { return corrected };
+    for sample in &mut corrected.samples {
+        let Some(joints) = &sample.joints else { continue };
+        let forward = |joints: &[f64]| chain.forward(joints).ok();
+        let moved = corner_fit::corrected_joints(joints, offsets);
+        if let (Some(before), Some(after)) = (forward(joints), forward(&moved)) {
+            sample.base_from_flange = after * before.inverse() * sample.base_from_flange;
+        }
+    }
+    corrected
+}
+
+fn select(measurements: &[Measurement], is_inlier: &[bool]) -> Vec<Measurement> {
+    measurements.iter().zip(is_inlier).filter(|(_, is_inlier)| **is_inlier).map(|(m, _)| m.clone()).collect()
+}
+
+/// The closed form with the smallest leave-one-out scatter, and its solution.
+fn best_closed_form(measurements: &[Measurement], fallback: Solution) -> (ClosedForm, Solution) {
+    const MAX_FOLDS: usize = 20;
+    let pairs: Vec<(Transform, Transform)> = measurements.iter().map(|m| (m.a, m.camera_from_board)).collect();
+    let stride = pairs.len().div_ceil(MAX_FOLDS).max(1);
+    let score = |solver: ClosedForm| -> Option<f64> {
+        let boards: Option<Vec<Transform>> = (0..pairs.len())
+            .step_by(stride)
+            .map(|left_out| {
+                let mut others = pairs.clone();
+                let (a, camera_from_board) = others.remove(left_out);
+                Some(a * consensus::solve(&others, solver)?.x * camera_from_board)
+            })
+            .collect();
+        Some(evaluation::scatter(&boards?)?.mm)
+    };
+    ClosedForm::ALL
+        .into_iter()
+        .filter_map(|solver| Some((score(solver)?, solver, consensus::solve(&pairs, solver)?)))
+        .min_by(|a, b| a.0.total_cmp(&b.0))
+        .map_or((ClosedForm::ParkMartin, fallback), |(_, solver, solution)| (solver, solution))
+}
+
+/// Standard deviation of the corners from the residuals of the single images, pixels. `None` for given poses.
+fn corner_noise(samples: &[Sample], choice: &[usize], is_inlier: &[bool]) -> Option<f64> {
+    const MIN_PX: f64 = 0.003; // Exact corners of a simulation.
+    let (mut squares, mut n_free) = (0.0, 0.0);
+    for ((sample, choice), _) in samples.iter().zip(choice).zip(is_inlier).filter(|(_, is_inlier)| **is_inlier) {
+        let corners = sample.candidates[*choice].corners.as_ref()?;
+        squares += corners.squares_px2;
+        n_free += 2.0 * corners.is_inlier.iter().filter(|is_inlier| **is_inlier).count() as f64 - 6.0;
+    }
+    Some((squares / f64::max(n_free, 1.0)).sqrt().max(MIN_PX))
+}
+
+/// A fit and the samples that agree with it.
+struct Stage {
+    fit: PoseFit,
+    /// Noise that determines the weights of the fit.
+    weighting: HandEyeNoise,
+    is_inlier: Vec<bool>,
+    squared_distances: Vec<f64>,
+}
+
+/// Alternates between fits and the selection of samples and candidates.
+fn reject_and_fit(
+    input: &HandEyeInput<'_>,
+    samples: &[Sample],
+    choice: &mut Vec<usize>,
+    mut is_inlier: Vec<bool>,
+    initial: Solution,
+    mut noise: HandEyeNoise,
+) -> Result<Stage, Error> {
+    /// Squared distance with six degrees of freedom that one good sample in 100 000 exceeds.
+    const MAX_SQUARED_DISTANCE: f64 = 33.1;
+    const MAX_ROUNDS: usize = 8;
+    let mut solution = initial;
+    let mut stage = None;
+    for _ in 0..MAX_ROUNDS {
+        let n_used = is_inlier.iter().filter(|is_inlier| **is_inlier).count();
+        if n_used < MIN_SAMPLES || 2 * n_used < samples.len() {
+            return Err(Error::Refused(Box::new(Refusal::new(
+                format!("only {n_used} of {} samples agree with each other", samples.len()),
+                "check that each robot pose belongs to its image and that neither board nor camera was moved",
+            ))));
+        }
+        let measurements = pose_fit::measurements(samples, choice);
+        let fit = pose_fit::fit(input.setup, &select(&measurements, &is_inlier), solution, noise)?;
+        (solution, noise) = (fit.solution, fit.noise);
+        let next_choice = consensus::choose(samples, &solution);
+        let measurements = pose_fit::measurements(samples, &next_choice);
+        let squared_distances: Vec<f64> = measurements
+            .iter()
+            .zip(&is_inlier)
+            .map(|(measurement, is_used)| pose_fit::squared_distance(input.setup, measurement, &fit, *is_used))
+            .collect();
+        let next: Vec<bool> = squared_distances.iter().map(|squared| *squared <= MAX_SQUARED_DISTANCE).collect();
+        let is_settled = next == is_inlier && next_choice == *choice;
+        stage = Some(Stage { weighting: fit.noise, fit, is_inlier: is_inlier.clone(), squared_distances });
+        if is_settled {
+            break;
+        }
+        (is_inlier, *choice) = (next, next_choice);
+    }
+    stage.ok_or(Error::TooFewResiduals { n_residuals: 0, n_params: N_PARAMS })
+}
+
+/// Corners of a sample in the chosen board frame, without outliers.
+pub(super) fn corners(input: &HandEyeInput<'_>, sample: &Sample, choice: usize) -> Vec<BoardPoint> {
+    let candidate = &sample.candidates[choice];
+    let (BoardObservation::View(view), Some(corners)) = (&input.samples[sample.sample_ix].board, &candidate.corners)
+    else {
+        return Vec::new();
+    };
+    let equivalent_from_board = candidate.board_from_equivalent.inverse();
+    view.points
+        .iter()
+        .zip(&corners.is_inlier)
+        .filter(|(_, is_inlier)| **is_inlier)
+        .map(|(point, _)| BoardPoint {
+            point_in_board: (equivalent_from_board * nalgebra::Point3::from(point.point_in_board)).coords,
+            pixel: point.pixel,
+        })
+        .collect()
+}
+
+/// Samples, the candidate of each, and the fit to those that agree.
+#[derive(Clone, Copy)]
+struct Selection<'a> {
+    input: &'a HandEyeInput<'a>,
+    samples: &'a [Sample],
+    choice: &'a [usize],
+    stage: &'a Stage,
+}
+
+/// What is estimated besides hand-eye transform and board pose.
+#[derive(Clone, Copy)]
+struct Free {
+    intrinsics: bool,
+    joints: bool,
+}
+
+fn corner_fit(
+    selection: Selection<'_>,
+    intrinsics: &Intrinsics,
+    offsets: &[f64],
+    free: Free,
+) -> Result<Fit<CornerState>, Error> {
+    let Selection { input, samples, choice, stage } = selection;
+    let used = samples.iter().zip(choice).zip(&stage.is_inlier).filter(|(_, is_inlier)| **is_inlier);
+    let chain = input.chain.filter(|_| free.joints);
+    let views: Vec<View> = used
+        .map(|((sample, choice), _)| {
+            let given = &input.samples[sample.sample_ix];
+            let joints = chain.and(given.joints.clone()).unwrap_or_default();
+            View { base_from_flange: given.base_from_flange, points: corners(input, sample, *choice), joints }
+        })
+        .collect();
+    let problem = CornerProblem {
+        setup: input.setup,
+        views: &views,
+        noise: stage.weighting,
+        n_intrinsics: if free.intrinsics { intrinsics.params().len() } else { 0 },
+        chain,
+    };
+    let n_inner = chain.map_or(0, |chain| chain.n_joints().saturating_sub(2));
+    let joint_offsets = if offsets.len() == n_inner { offsets.to_vec() } else { vec![0.0; n_inner] };
+    let pose_errors = vec![Vector6::zeros(); views.len()];
+    problem.minimize(CornerState {
+        solution: stage.fit.solution,
+        intrinsics: intrinsics.clone(),
+        joint_offsets,
+        pose_errors,
+    })
+}
+
+fn finish(
+    samples: Vec<Sample>,
+    choice: Vec<usize>,
+    stage: Stage,
+    closed_form: ClosedForm,
+    intrinsics: Option<Intrinsics>,
+) -> Refined {
+    // The 95 % quantile of F with 6 and n degrees of freedom relative to that of chi squared / 6, to first order.
+    const CHI_SQUARED_95: f64 = 12.59;
+    let enlarged = 1.0 + (CHI_SQUARED_95 - 4.0) / (2.0 * stage.fit.n_free);
+    Refined {
+        solution: stage.fit.solution,
+        noise: stage.fit.noise,
+        weighting: stage.weighting,
+        covariance: stage.fit.covariance * enlarged,
+        samples,
+        choice,
+        is_inlier: stage.is_inlier,
+        squared_distances: stage.squared_distances,
+        closed_form,
+        intrinsics,
+        intrinsics_sigma: Vec::new(),
+        joint_offsets: Vec::new(),
+        warnings: Vec::new(),
+    }
+}
+
+/// `a` of a sample with corrected joints.
+pub(super) fn board_in_parent(solution: &Solution, measurement: &Measurement) -> Transform {
+    measurement.a * solution.x * measurement.camera_from_board
+}
+
+/// Predicted pose of the board.
+pub(super) fn predicted(solution: &Solution, sample: &Sample) -> Transform {
+    solution.camera_from_board(&sample.a)
+}
+
+/// Residual of a sample: rotation in radians and translation in meters.
+pub(super) fn sample_residual(solution: &Solution, sample: &Sample, choice: usize) -> Vector6<f64> {
+    geometry::residual(&predicted(solution, sample), &sample.candidates[choice].camera_from_board)
+}

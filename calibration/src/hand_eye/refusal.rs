@@ -1,0 +1,25 @@
+//! Reasons to refuse a calibration: what is not observable, and which motion would make it so.
+
+/// Why no calibration is returned although the input is valid.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Refusal {
+    /// What is missing or wrong, with values.
+    pub why: String,
+    /// Axis in the flange frame, a unit vector: the only axis of rotation seen, or the direction that is not observable.
+    /// `None` if the reason is not about an axis.
+    pub axis: Option<[f64; 3]>,
+    /// The motion or correction that would help.
+    pub motion: String,
+}
+
+impl std::fmt::Display for Refusal {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "{}; {}", self.why, self.motion)
+    }
+}
+
+impl Refusal {
+    pub(crate) fn new(why: impl Into<String>, motion: impl Into<String>) -> Self {
+        Self { why: why.into(), axis: None, motion: motion.into() }
+    }
+}

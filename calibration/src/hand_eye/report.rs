@@ -1,0 +1,282 @@
+//! Result of a hand-eye calibration: transforms, uncertainty, and errors per sample.
+
+use super::closed_form::ClosedForm;
+use super::evaluation::{self, Scatter};
+use super::geometry;
+use super::mistakes;
+use super::pose_fit::{self, HandEyeNoise, Measurement};
+use super::refine::{self, Refined};
+use super::{HandEyeInput, Setup};
+use crate::Error;
+use kinematics::{Intrinsics, Transform};
+use nalgebra::Matrix6;
+
+/// Result of [`super::calibrate_hand_eye`].
+#[derive(Clone, Debug)]
+pub struct HandEyeCalibration {
+    /// Where the camera is mounted.
+    pub setup: Setup,
+    /// `flange_from_camera` (eye in hand) or `base_from_camera` (eye to hand).
+    pub parent_from_camera: Transform,
+    /// `base_from_board` (eye in hand) or `flange_from_board` (eye to hand).
+    pub parent_from_board: Transform,
+    /// Covariance of `parent_from_camera`: position in meters along the camera's x, y and z axes, then rotation in
+    /// radians around them. `error.dot(inverse(covariance) * error)` stays below 12.59 with a probability of 95 %.
+    pub covariance: Matrix6<f64>,
+    /// Standard deviations of the position along the camera's axes, millimeters.
+    pub sigma_mm: [f64; 3],
+    /// Standard deviations of the rotation around the camera's axes, degrees.
+    pub sigma_deg: [f64; 3],
+    /// Scatter of the board over the used samples, with the result of all of them.
+    pub scatter: Scatter,
+    /// The same with leave-one-out: each sample is evaluated with a calibration from the others.
+    pub held_out_scatter: Option<Scatter>,
+    /// RMS length of the reprojection error of the used corners, pixels. The robot poses are taken as exact.
+    pub rms_px: Option<f64>,
+    /// The same with leave-one-out.
+    pub held_out_rms_px: Option<f64>,
+    /// Estimated measurement errors.
+    pub noise: HandEyeNoise,
+    /// Closed form that gave the initial solution: that with the smallest leave-one-out scatter.
+    pub closed_form: ClosedForm,
+    /// Intrinsics, if they were estimated, and their standard deviations in the order of [`Intrinsics::params`].
+    pub intrinsics: Option<(Intrinsics, Vec<f64>)>,
+    /// Offsets of the joints, if they were estimated, in the order of the chain.
+    pub joint_offsets: Vec<JointOffset>,
+    /// One entry per sample of the input.
+    pub samples: Vec<SampleReport>,
+    /// Problems that do not invalidate the result, one sentence each.
+    pub warnings: Vec<String>,
+    /// Everything that [`super::suggest_next_poses`] needs.
+    pub(super) refined: Refined,
+}
+
+/// Offset of one joint: the joint is at the reported value plus the offset.
+#[derive(Clone, Debug, PartialEq)]
+pub struct JointOffset {
+    /// Name of the joint.
+    pub joint: String,
+    /// Offset and its standard deviation, radians or meters. `None` if it is not observable: the first joint is
+    /// equivalent to a motion of the board, and the last one to a motion of the camera.
+    pub estimate: Option<[f64; 2]>,
+}
+
+/// Use of a sample.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum SampleStatus {
+    /// Used.
+    Used,
+    /// Excluded: it disagrees with the other samples.
+    Outlier,
+    /// The corners do not determine a pose of the board.
+    NoBoard,
+}
+
+/// Errors of one sample.
+#[derive(Clone, Debug, PartialEq)]
+pub struct SampleReport {
+    /// Name of the sample.
+    pub name: String,
+    /// Use.
+    pub status: SampleStatus,
+    /// Distance between measured and predicted board origin, millimeters. `None` without a board pose.
+    pub position_mm: Option<f64>,
+    /// Angle between measured and predicted board, degrees.
+    pub rotation_deg: Option<f64>,
+    /// Deviation relative to the estimated noise: 1 is typical.
+    pub normalized: Option<f64>,
+    /// RMS reprojection error, pixels.
+    pub rms_px: Option<f64>,
+}
+
+/// Largest standard deviation of a joint offset that counts as observable, radians or meters.
+const MAX_JOINT_SIGMA: f64 = 0.0175;
+
+/// Evaluates a refined solution.
+pub(super) fn report(
+    input: &HandEyeInput<'_>,
+    refined: &Refined,
+    without_board: &[usize],
+) -> Result<HandEyeCalibration, Error> {
+    let measurements = refined.measurements();
+    let boards = measurements.iter().map(|m| refine::board_in_parent(&refined.solution, m));
+    let internal = || Error::HandEyeInput { why: "the board poses have no mean rotation".to_owned() };
+    let scatter = evaluation::scatter(&boards.collect::<Vec<_>>()).ok_or_else(internal)?;
+    let held_out = HeldOut::new(input, refined, &measurements);
+    let covariance = position_first(&refined.covariance.fixed_view::<6, 6>(0, 0).into_owned());
+    let sigma = |first: usize| [0, 1, 2].map(|axis| covariance[(first + axis, first + axis)].max(0.0).sqrt());
+    let samples = sample_reports(input, refined, without_board);
+    Ok(HandEyeCalibration {
+        setup: input.setup,
+        parent_from_camera: refined.solution.x,
+        parent_from_board: refined.solution.y,
+        covariance,
+        sigma_mm: sigma(0).map(|sigma_m| 1e3 * sigma_m),
+        sigma_deg: sigma(3).map(f64::to_degrees),
+        scatter,
+        held_out_scatter: held_out.scatter,
+        rms_px: rms_px(input, refined, |_| Some(refined.solution)),
+        held_out_rms_px: held_out.rms_px,
+        noise: refined.noise,
+        closed_form: refined.closed_form,
+        intrinsics: refined
+            .intrinsics
+            .clone()
+            .filter(|_| input.options.estimate_intrinsics)
+            .map(|intrinsics| (intrinsics, refined.intrinsics_sigma.clone())),
+        joint_offsets: joint_offsets(input, refined),
+        warnings: warnings(input, refined, &samples),
+        samples,
+        refined: refined.clone(),
+    })
+}
+
+fn position_first(covariance: &Matrix6<f64>) -> Matrix6<f64> {
+    Matrix6::from_fn(|row, column| covariance[((row + 3) % 6, (column + 3) % 6)])
+}
+
+struct HeldOut {
+    scatter: Option<Scatter>,
+    rms_px: Option<f64>,
+}
+
+impl HeldOut {
+    fn new(input: &HandEyeInput<'_>, refined: &Refined, measurements: &[Measurement]) -> Self {
+        // With corners, the weights were chosen by held-out errors.
+        let knows_noise = refined.noise.corner_px.is_some();
+        let folds =
+            evaluation::leave_one_out(input.setup, measurements, refined.solution, refined.weighting, knows_noise);
+        let boards: Option<Vec<Transform>> = folds
+            .iter()
+            .zip(measurements)
+            .map(|(solution, m)| Some(refine::board_in_parent(solution.as_ref()?, m)))
+            .collect();
+        let scatter =
+            boards.filter(|boards| boards.len() > super::MIN_SAMPLES).and_then(|boards| evaluation::scatter(&boards));
+        let rms_px = scatter.and_then(|_| rms_px(input, refined, |used_ix| folds[used_ix]));
+        Self { scatter, rms_px }
+    }
+}
+
+/// RMS reprojection error of the used samples, with one solution per used sample. `None` for given poses.
+fn rms_px(
+    input: &HandEyeInput<'_>,
+    refined: &Refined,
+    solution: impl Fn(usize) -> Option<geometry::Solution>,
+) -> Option<f64> {
+    let intrinsics = refined.intrinsics.as_ref()?;
+    let used = refined.samples.iter().zip(&refined.choice).zip(&refined.is_inlier).filter(|(_, is_inlier)| **is_inlier);
+    let (mut squares, mut n) = (0.0, 0);
+    for (used_ix, ((sample, choice), _)) in used.enumerate() {
+        let points = refine::corners(input, sample, *choice);
+        squares +=
+            evaluation::reprojection_squares(&refine::predicted(&solution(used_ix)?, sample), &points, intrinsics);
+        n += points.len();
+    }
+    (n > 0).then(|| (squares / n as f64).sqrt())
+}
+
+fn sample_reports(input: &HandEyeInput<'_>, refined: &Refined, without_board: &[usize]) -> Vec<SampleReport> {
+    let mut reports: Vec<SampleReport> = input
+        .samples
+        .iter()
+        .map(|sample| SampleReport {
+            name: sample.name.clone(),
+            status: SampleStatus::NoBoard,
+            position_mm: None,
+            rotation_deg: None,
+            normalized: None,
+            rms_px: None,
+        })
+        .collect();
+    debug_assert_eq!(refined.samples.len() + without_board.len(), reports.len(), "every sample is usable or not");
+    for (ix, sample) in refined.samples.iter().enumerate() {
+        let report = &mut reports[sample.sample_ix];
+        let residual = refine::sample_residual(&refined.solution, sample, refined.choice[ix]);
+        report.status = if refined.is_inlier[ix] { SampleStatus::Used } else { SampleStatus::Outlier };
+        report.rotation_deg = Some(residual.fixed_rows::<3>(0).norm().to_degrees());
+        report.position_mm = Some(1e3 * residual.fixed_rows::<3>(3).norm());
+        report.normalized = Some((refined.squared_distances[ix] / 6.0).sqrt());
+        let points = refine::corners(input, sample, refined.choice[ix]);
+        report.rms_px = refined.intrinsics.as_ref().filter(|_| !points.is_empty()).map(|intrinsics| {
+            let pose = refine::predicted(&refined.solution, sample);
+            (evaluation::reprojection_squares(&pose, &points, intrinsics) / points.len() as f64).sqrt()
+        });
+    }
+    reports
+}
+
+fn joint_offsets(input: &HandEyeInput<'_>, refined: &Refined) -> Vec<JointOffset> {
+    let Some(chain) = input.chain.filter(|_| input.options.estimate_joint_offsets) else { return Vec::new() };
+    let last_ix = chain.n_joints().saturating_sub(1);
+    let names = chain.joint_names().iter().enumerate();
+    names
+        .map(|(ix, joint)| {
+            let inner = (ix > 0 && ix < last_ix).then(|| refined.joint_offsets.get(ix - 1)).flatten();
+            let estimate =
+                inner.filter(|(_, sigma)| *sigma <= MAX_JOINT_SIGMA).map(|(offset, sigma)| [*offset, *sigma]);
+            JointOffset { joint: joint.clone(), estimate }
+        })
+        .collect()
+}
+
+fn warnings(input: &HandEyeInput<'_>, refined: &Refined, reports: &[SampleReport]) -> Vec<String> {
+    let mut warnings = refined.warnings.clone();
+    let named = |status: SampleStatus| -> Vec<&str> {
+        reports.iter().filter(|report| report.status == status).map(|report| report.name.as_str()).collect()
+    };
+    let outliers = named(SampleStatus::Outlier);
+    if !outliers.is_empty() {
+        warnings.push(format!(
+            "{} samples disagree with the others and were not used: {}",
+            outliers.len(),
+            outliers.join(", ")
+        ));
+    }
+    let without = named(SampleStatus::NoBoard);
+    if !without.is_empty() {
+        warnings.push(format!(
+            "{} images do not show enough corners for a pose: {}",
+            without.len(),
+            without.join(", ")
+        ));
+    }
+    let poses: Vec<(usize, Transform)> = refined
+        .samples
+        .iter()
+        .zip(&refined.choice)
+        .map(|(sample, choice)| (sample.sample_ix, sample.candidates[*choice].camera_from_board))
+        .collect();
+    let mirrored = mistakes::mirrored(&input.samples, &poses);
+    if !mirrored.is_empty() {
+        warnings.push(format!("{} samples show the board mirrored: {}", mirrored.len(), mirrored.join(", ")));
+    }
+    let n_used = refined.is_inlier.iter().filter(|is_inlier| **is_inlier).count();
+    if n_used < 6 {
+        warnings.push(format!("only {n_used} samples were used: with fewer than 6, wrong samples may go unnoticed"));
+    }
+    warnings
+}
+
+/// Distance of a calibration from the truth in its own uncertainty: 95 % of the results stay below 12.59.
+#[cfg(test)]
+pub(super) fn squared_error(calibration: &HandEyeCalibration, truth: &Transform) -> f64 {
+    let difference = calibration.parent_from_camera.inverse() * truth;
+    let rotation = difference.rotation.scaled_axis();
+    let translation = difference.translation.vector;
+    let error = nalgebra::Vector6::new(translation.x, translation.y, translation.z, rotation.x, rotation.y, rotation.z);
+    calibration.covariance.cholesky().map_or(f64::INFINITY, |factor| error.dot(&factor.solve(&error)))
+}
+
+/// Covariance of a residual, for information gains.
+pub(super) fn residual_information(
+    setup: Setup,
+    measurement: &Measurement,
+    solution: &geometry::Solution,
+    noise: &HandEyeNoise,
+) -> Option<(geometry::Matrix6x12, Matrix6<f64>)> {
+    let predicted = solution.camera_from_board(&measurement.a);
+    let jacobian = geometry::residual_jacobian(&predicted, &nalgebra::Vector6::zeros());
+    let weight = pose_fit::covariance(setup, measurement, solution, noise).cholesky()?.inverse();
+    Some((jacobian, weight))
+}

@@ -1,0 +1,170 @@
+//! Initial time offset by correlation of rotation rates.
+//!
+//! The magnitude of the rotation rate of rigidly joined bodies is the same in every frame (Furrer et al. 2017, "Evaluation
+//! of combined time-offset estimation and hand-eye calibration on robotic datasets").
+
+use super::stream::Stream;
+use crate::hand_eye::Refusal;
+
+/// Correlation below this value does not show a common motion.
+const MIN_CORRELATION: f64 = 0.3;
+
+/// The initial offset, accurate to about a step of the grid.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Coarse {
+    pub(super) offset_secs: f64,
+    pub(super) step_secs: f64,
+}
+
+/// The offset with the most significant correlation, followed by other maxima.
+///
+/// # Errors
+/// If the streams have no rotation, or no significant correlation.
+pub(super) fn correlate(a: &Stream, b: &Stream, max_offset_secs: Option<f64>) -> Result<Vec<Coarse>, Refusal> {
+    const MAX_POINTS: f64 = 4000.0;
+    const MIN_OVERLAP: f64 = 0.25;
+    /// Lower maxima are not tried.
+    const SIMILAR: f64 = 0.7;
+    const MAX_OTHERS: usize = 4;
+    let durations = [a, b].map(|stream| stream.end_secs() - stream.start_secs());
+    let finest = a.step_secs().max(b.step_secs());
+    let step_secs = finest.max(durations[0].max(durations[1]) / MAX_POINTS);
+    let window_secs = 2.0 * step_secs;
+    let (rates_a, rates_b) = (Rates::new(a, step_secs, window_secs), Rates::new(b, step_secs, window_secs));
+    for (name, rates) in [("A", &rates_a), ("B", &rates_b)] {
+        rates.check_excitation(name)?;
+    }
+    let (n_a, n_b) = (signed(rates_a.values.len()), signed(rates_b.values.len()));
+    let min_overlap = (MIN_OVERLAP * n_a.min(n_b) as f64).max(10.0);
+    let base_secs = a.start_secs() - b.start_secs();
+    // Without a limit, clocks with different zeros are allowed, as long as the recordings overlap.
+    let offset_at = |lag: i64| base_secs + lag as f64 * step_secs;
+    let correlations: Vec<Correlation> = (-n_b..=n_a)
+        .filter(|lag| max_offset_secs.is_none_or(|most| offset_at(*lag).abs() <= most))
+        .filter_map(|lag| Correlation::new(&rates_a, &rates_b, lag, min_overlap))
+        .collect();
+    let Some(best) = correlations.iter().max_by(|p, q| p.significance.total_cmp(&q.significance)) else {
+        return Err(Refusal::new(
+            "the streams do not overlap in the allowed range of offsets",
+            "record both streams at the same time, or allow a larger offset",
+        ));
+    };
+    if best.value < MIN_CORRELATION {
+        return Err(Refusal::new(
+            format!(
+                "the rotation rates of the streams are not correlated (at most {:.2}; at least {MIN_CORRELATION} is needed)",
+                best.value
+            ),
+            "check that both bodies are rigidly joined and recorded at the same time, and rotate them irregularly",
+        ));
+    }
+    let others = other_maxima(&correlations, best);
+    let lags = [best]
+        .into_iter()
+        .chain(others.into_iter().filter(|other| other.value > SIMILAR * best.value).take(MAX_OTHERS))
+        .map(|correlation| correlation.lag);
+    Ok(lags.map(|lag| Coarse { offset_secs: offset_at(lag), step_secs }).collect())
+}
+
+fn signed(n: usize) -> i64 {
+    i64::try_from(n).unwrap_or(i64::MAX / 2)
+}
+
+/// Rotation rates on a regular grid; `None` in gaps.
+struct Rates {
+    values: Vec<Option<f64>>,
+}
+
+impl Rates {
+    fn new(stream: &Stream, step_secs: f64, window_secs: f64) -> Self {
+        let duration = stream.end_secs() - stream.start_secs();
+        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a few thousand")]
+        let n = (duration / step_secs) as usize + 1;
+        let at = |ix: usize| stream.rotation_rate(stream.start_secs() + ix as f64 * step_secs, window_secs);
+        let mut values: Vec<Option<f64>> = (0..n).map(at).collect();
+        // A single wrong pose gives a rate that would dominate the correlation.
+        let mut sorted: Vec<f64> = values.iter().flatten().copied().collect();
+        if let Some(limit) = kinematics::quantile::quantile(&mut sorted, 0.95, kinematics::quantile::Rank::Nearest) {
+            values.iter_mut().flatten().for_each(|rate| *rate = rate.min(limit));
+        }
+        Self { values }
+    }
+
+    /// # Errors
+    /// If the rate hardly changes.
+    fn check_excitation(&self, name: &str) -> Result<(), Refusal> {
+        /// A tenth of what a hand-held or slowly moving camera does; below, noise of tracking dominates.
+        const MIN_DEVIATION_RAD_S: f64 = 0.02;
+        let rates: Vec<f64> = self.values.iter().flatten().copied().collect();
+        let n = rates.len().max(1) as f64;
+        let mean = rates.iter().sum::<f64>() / n;
+        let deviation = (rates.iter().map(|rate| (rate - mean).powi(2)).sum::<f64>() / n).sqrt();
+        if deviation >= MIN_DEVIATION_RAD_S {
+            return Ok(());
+        }
+        let what = if mean < MIN_DEVIATION_RAD_S { "hardly rotates" } else { "rotates at a constant rate" };
+        Err(Refusal::new(
+            format!(
+                "body {name} {what} ({:.2} degrees/s, deviation {:.2}; a deviation of at least {:.1} is needed): the motion does not depend on the time offset",
+                mean.to_degrees(),
+                deviation.to_degrees(),
+                MIN_DEVIATION_RAD_S.to_degrees()
+            ),
+            "rotate the bodies back and forth, with pauses and changes of speed",
+        ))
+    }
+}
+
+/// Correlation at one lag.
+struct Correlation {
+    lag: i64,
+    value: f64,
+    /// Value of the t statistic, which weighs long overlaps.
+    significance: f64,
+}
+
+impl Correlation {
+    /// Correlation of `a[ix]` with `b[ix - lag]`. `None` if the overlap is too short.
+    fn new(a: &Rates, b: &Rates, lag: i64, min_overlap: f64) -> Option<Self> {
+        let first = usize::try_from(lag.max(0)).ok()?;
+        let first_b = usize::try_from((-lag).max(0)).ok()?;
+        let (a, b) = (a.values.get(first..)?, b.values.get(first_b..)?);
+        let (mut n, mut sums, mut squares, mut product) = (0.0, [0.0; 2], [0.0; 2], 0.0);
+        for (x, y) in a.iter().zip(b).filter_map(|(a, b)| Some(((*a)?, (*b)?))) {
+            n += 1.0;
+            sums[0] += x;
+            sums[1] += y;
+            squares[0] += x * x;
+            squares[1] += y * y;
+            product += x * y;
+        }
+        (n >= min_overlap).then_some(())?;
+        let variance = |ix: usize| squares[ix] / n - (sums[ix] / n).powi(2);
+        let value = (product / n - sums[0] * sums[1] / (n * n)) / (variance(0) * variance(1)).sqrt();
+        value.is_finite().then_some(())?;
+        let significance = value * (n / (1.0 - value * value).max(1e-9)).sqrt();
+        Some(Self { lag, value, significance })
+    }
+}
+
+/// Maxima outside the neighborhood of the best one, the most significant first.
+fn other_maxima<'a>(correlations: &'a [Correlation], best: &Correlation) -> Vec<&'a Correlation> {
+    let is_maximum = |ix: usize| {
+        let value = correlations[ix].value;
+        ix > 0
+            && ix + 1 < correlations.len()
+            && value >= correlations[ix - 1].value
+            && value > correlations[ix + 1].value
+    };
+    // The neighborhood of the maximum ends where the correlation falls to half.
+    let best_ix = correlations.iter().position(|correlation| correlation.lag == best.lag).unwrap_or(0);
+    let is_high = |correlation: &Correlation| correlation.value > 0.5 * best.value;
+    let n_after = correlations[best_ix..].iter().take_while(|correlation| is_high(correlation)).count();
+    let n_before = correlations[..best_ix].iter().rev().take_while(|correlation| is_high(correlation)).count();
+    let mut others: Vec<&Correlation> = (0..correlations.len())
+        .filter(|ix| (ix + n_before < best_ix || *ix >= best_ix + n_after) && is_maximum(*ix))
+        .map(|ix| &correlations[ix])
+        .collect();
+    others.sort_by(|p, q| q.significance.total_cmp(&p.significance));
+    others
+}

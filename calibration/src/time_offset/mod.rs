@@ -1,0 +1,242 @@
+//! Time offset between two pose streams of rigidly joined bodies, such as a camera and a tracked marker or an arm.
+//!
+//! The correlation of rotation rates gives an initial offset. A continuous-time fit refines it together with the rotation
+//! between the bodies. The stated uncertainty allows for errors that are correlated in time.
+
+mod coarse;
+mod fine;
+mod stream;
+#[cfg(test)]
+mod tests;
+
+use crate::Error;
+use crate::hand_eye::{
+    BoardObservation, HandEyeInput, HandEyeOptions, HandEyeSample, Refusal, Scatter, Setup, calibrate_hand_eye,
+};
+use kinematics::Transform;
+use stream::Stream;
+
+/// A pose of a body at one time.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct PoseSample {
+    /// Time on the clock of the stream, seconds.
+    pub secs: f64,
+    /// `reference_from_body`, for example `world_from_camera`.
+    pub pose: Transform,
+}
+
+/// Options of [`estimate_time_offset`].
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct TimeOffsetOptions {
+    /// Also estimates the rigid transform between the bodies.
+    pub hand_eye: bool,
+    /// Largest absolute offset that is searched, seconds. `None` searches all offsets at which the recordings overlap.
+    pub max_offset_secs: Option<f64>,
+    /// Refuses a result with a larger standard deviation, seconds.
+    pub max_sigma_secs: f64,
+}
+
+impl Default for TimeOffsetOptions {
+    fn default() -> Self {
+        Self { hand_eye: false, max_offset_secs: None, max_sigma_secs: 0.02 }
+    }
+}
+
+/// Result of [`estimate_time_offset`].
+#[derive(Clone, Debug)]
+pub struct TimeOffset {
+    /// Seconds to add to B's clock to get A's; with a drift, at `mid_secs`.
+    pub offset_secs: f64,
+    /// Standard deviation of the offset.
+    pub sigma_secs: f64,
+    /// Drift of A's clock relative to B's and its standard deviation, parts per million. `None` if it is not significant
+    /// (three standard deviations). A's clock is at `secs_b + offset_secs + 1e-6 * drift * (secs_b - mid_secs)`.
+    pub drift_ppm: Option<[f64; 2]>,
+    /// Middle of the overlap on B's clock.
+    pub mid_secs: f64,
+    /// RMS difference of the orientations after alignment, degrees.
+    pub rms_deg: f64,
+    /// The transform between the bodies, or why it is refused. `None` if it was not asked for.
+    pub hand_eye: Option<Result<BodyTransform, Refusal>>,
+}
+
+/// The rigid transform between two bodies.
+#[derive(Clone, Debug)]
+pub struct BodyTransform {
+    /// Pose of body B in the frame of body A.
+    pub a_body_from_b_body: Transform,
+    /// Standard deviations of the position along B's axes, millimeters.
+    pub sigma_mm: [f64; 3],
+    /// Standard deviations of the rotation around B's axes, degrees.
+    pub sigma_deg: [f64; 3],
+    /// Scatter of B's reference frame in A's reference frame.
+    pub scatter: Scatter,
+}
+
+/// Estimates the time offset between two streams of poses.
+///
+/// The streams may have different rates, gaps, outliers and clocks with different zeros, but must overlap in time.
+///
+/// # Errors
+/// [`Error::Refused`] if the motion does not determine the offset. [`Error::TimeOffsetInput`] if a stream is invalid.
+///
+/// ```
+/// use calibration::time_offset::{PoseSample, TimeOffsetOptions, estimate_time_offset};
+/// use kinematics::Transform;
+/// use nalgebra::Vector3;
+///
+/// let at = |secs: f64| {
+///     let rotation = Vector3::new((1.3 * secs).sin(), (0.9 * secs * secs).cos() * 0.4, (2.1 * secs).cos() * 0.5);
+///     Transform::new(Vector3::zeros(), rotation)
+/// };
+/// let stream = |step_secs: f64, clock_secs: f64| -> Vec<PoseSample> {
+///     (0..).map(|ix| f64::from(ix) * step_secs).take_while(|secs| *secs < 8.0)
+///         .map(|secs| PoseSample { secs: secs + clock_secs, pose: at(secs) }).collect()
+/// };
+/// let offset = estimate_time_offset(&stream(0.01, 100.0), &stream(0.033, 0.25), &TimeOffsetOptions::default())?;
+/// assert!((offset.offset_secs - 99.75).abs() < 1e-3);
+/// # Ok::<(), calibration::Error>(())
+/// ```
+pub fn estimate_time_offset(
+    a: &[PoseSample],
+    b: &[PoseSample],
+    options: &TimeOffsetOptions,
+) -> Result<TimeOffset, Error> {
+    let refused = |refusal| Error::Refused(Box::new(refusal));
+    let (a, b) = (Stream::new("A", a)?, Stream::new("B", b)?);
+    let coarse = coarse::correlate(&a, &b, options.max_offset_secs).map_err(refused)?;
+    // The stream with the higher rate is interpolated, because its interpolation errors are smaller.
+    let is_swapped = b.step_secs() < a.step_secs();
+    let (interpolated, points) = if is_swapped { (&b, &a) } else { (&a, &b) };
+    let sign = if is_swapped { -1.0 } else { 1.0 };
+    let (coarse, fine) = refine_best(interpolated, points, &coarse, sign)?;
+    let offset_secs = sign * fine.offset_secs;
+    if (offset_secs - coarse.offset_secs).abs() > 10.0 * coarse.step_secs {
+        return Err(refused(Refusal::new(
+            format!(
+                "the offset of the rotation rates ({:.3} s) and that of the orientations ({offset_secs:.3} s) disagree",
+                coarse.offset_secs
+            ),
+            "check that both streams are poses of the bodies (reference_from_body), not their inverses",
+        )));
+    }
+    // Written so that NaN is refused.
+    let is_certain = fine.sigma_secs <= options.max_sigma_secs;
+    if !is_certain {
+        return Err(refused(Refusal::new(
+            format!(
+                "the offset is uncertain by {:.1} ms (at most {:.1} ms): the rotation changes too slowly for the noise of the poses",
+                1e3 * fine.sigma_secs,
+                1e3 * options.max_sigma_secs
+            ),
+            "rotate the bodies faster and with more changes of direction",
+        )));
+    }
+    let mid_secs = if is_swapped { fine.mid_secs + fine.offset_secs } else { fine.mid_secs };
+    let drift = fine.drift.map_or(0.0, |[drift, _]| sign * drift);
+    let secs_a = |secs_b: f64| secs_b + offset_secs + drift * (secs_b - mid_secs);
+    Ok(TimeOffset {
+        offset_secs,
+        sigma_secs: fine.sigma_secs,
+        drift_ppm: fine.drift.map(|[drift, sigma]| [1e6 * sign * drift, 1e6 * sigma]),
+        mid_secs,
+        rms_deg: fine.rms_rad.to_degrees(),
+        hand_eye: options.hand_eye.then(|| body_transform(&a, &b, secs_a)).transpose()?,
+    })
+}
+
+/// The refined offset with the smallest residuals, and where it started.
+///
+/// # Errors
+/// If another offset fits as well, or none.
+fn refine_best(
+    interpolated: &Stream,
+    points: &Stream,
+    starts: &[coarse::Coarse],
+    sign: f64,
+) -> Result<(coarse::Coarse, fine::Fine), Error> {
+    /// Residuals of a wrong offset exceed the noise by a large factor.
+    const SIMILAR: f64 = 1.5;
+    /// Differences that no tracking system resolves.
+    const EXACT_RAD: f64 = 1e-4;
+    /// Largest residual relative to the motion. Unrelated motions have about 1.
+    const MAX_RESIDUAL_FRAC: f64 = 0.25;
+    let mut found: Vec<(coarse::Coarse, fine::Fine)> = Vec::new();
+    let mut first_error = None;
+    for start in starts {
+        match fine::refine(interpolated, points, sign * start.offset_secs) {
+            Ok(fine) => found.push((*start, fine)),
+            Err(error) => first_error = first_error.or(Some(error)),
+        }
+    }
+    found.sort_by(|p, q| p.1.median_rad.total_cmp(&q.1.median_rad));
+    let refused = |why: String, motion: &str| Error::Refused(Box::new(Refusal::new(why, motion)));
+    let mut ranked = found.into_iter();
+    let Some((start, best)) = ranked.next() else {
+        let why = || Error::TimeOffsetInput { why: "there is no initial offset".to_owned() };
+        return Err(first_error.unwrap_or_else(why));
+    };
+    if best.median_rad > MAX_RESIDUAL_FRAC * best.motion_rad {
+        return Err(refused(
+            format!(
+                "after alignment, the orientations still differ by {:.1} degrees of {:.1} degrees of motion",
+                best.median_rad.to_degrees(),
+                best.motion_rad.to_degrees()
+            ),
+            "check that both bodies are rigidly joined and recorded at the same time, and that both streams are reference_from_body",
+        ));
+    }
+    let is_other = |fine: &fine::Fine| (fine.offset_secs - best.offset_secs).abs() > 5.0 * start.step_secs;
+    if let Some((_, other)) =
+        ranked.find(|(_, fine)| is_other(fine) && fine.median_rad < SIMILAR * best.median_rad + EXACT_RAD)
+    {
+        return Err(refused(
+            format!(
+                "the motion repeats: offsets that differ by {:.2} s fit equally well",
+                (other.offset_secs - best.offset_secs).abs()
+            ),
+            "move irregularly, or limit the offset that is searched",
+        ));
+    }
+    Ok((start, best))
+}
+
+/// Transform between the bodies from poses at the same times. The inner error is a refusal.
+fn body_transform(
+    a: &Stream,
+    b: &Stream,
+    secs_a: impl Fn(f64) -> f64,
+) -> Result<Result<BodyTransform, Refusal>, Error> {
+    /// More poses of a stream are not independent of each other.
+    const MAX_SAMPLES: usize = 50;
+    let pairs: Vec<(f64, Transform, Transform)> =
+        b.samples.iter().filter_map(|sample| Some((sample.secs, a.at(secs_a(sample.secs))?, sample.pose))).collect();
+    let stride = pairs.len().div_ceil(MAX_SAMPLES).max(1);
+    let samples = pairs.iter().step_by(stride).map(|(secs, a_pose, b_pose)| HandEyeSample {
+        name: format!("{secs:.3}"),
+        base_from_flange: *a_pose,
+        board: BoardObservation::Pose(b_pose.inverse()),
+        joints: None,
+    });
+    let input = HandEyeInput {
+        setup: Setup::EyeInHand,
+        samples: samples.collect(),
+        intrinsics: None,
+        board_symmetries: &[],
+        chain: None,
+        options: HandEyeOptions::default(),
+    };
+    match calibrate_hand_eye(&input) {
+        Ok(found) => Ok(Ok(BodyTransform {
+            a_body_from_b_body: found.parent_from_camera,
+            sigma_mm: found.sigma_mm,
+            sigma_deg: found.sigma_deg,
+            scatter: found.scatter,
+        })),
+        Err(Error::Refused(refusal)) => {
+            let named = |text: &str| text.replace("flange", "body A");
+            Ok(Err(Refusal { why: named(&refusal.why), axis: refusal.axis, motion: named(&refusal.motion) }))
+        }
+        Err(error) => Err(error),
+    }
+}
