@@ -325,7 +325,7 @@ mod tests {
 
         let candidates = |choice: CameraRefinement| choice.candidates().len();
         for (joints, depth, aligned, learned) in
-            [(true, true, 8, 1), (true, false, 1, 2), (false, true, 8, 2), (false, false, 1, 2)]
+            [(true, true, 8, 1), (true, false, 3, 2), (false, true, 8, 2), (false, false, 3, 2)]
         {
             let RefineSettings { align, with_scene } = refining(&[Refine::Auto], joints, depth).unwrap();
             assert_eq!(

@@ -123,11 +123,14 @@ pub fn recording(path: &Path, rig: Option<Rig>, overrides: &[Override]) -> crate
         chain_of(&rig)?
             .order_in(recorded)
             .with_context(|| format!("the recording {path:?} does not match the robot"))?;
-        if !rig.arm.joint_offsets.is_empty() {
+        let in_recorded_order = |offsets: &[f64]| -> Vec<f64> {
             let of = |name: &String| rig.arm.joints.iter().position(|known| known == name);
-            let offset = |name: &String| of(name).map_or(0.0, |ix| rig.arm.joint_offsets[ix]);
-            rig.arm.joint_offsets = recorded.iter().map(offset).collect();
-        }
+            let offset = |name: &String| of(name).and_then(|ix| offsets.get(ix)).copied().unwrap_or(0.0);
+            if offsets.is_empty() { Vec::new() } else { recorded.iter().map(offset).collect() }
+        };
+        let offsets =
+            [&rig.arm.joint_offsets, &rig.arm.sim.true_joint_offsets].map(|offsets| in_recorded_order(offsets));
+        [rig.arm.joint_offsets, rig.arm.sim.true_joint_offsets] = offsets;
         rig.arm.joints = recorded.to_vec();
     }
     check_intrinsics(&rig)?;

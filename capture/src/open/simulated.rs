@@ -164,8 +164,10 @@ fn camera_of(camera: &Camera) -> sim::CameraConfig {
 /// The depth sensor; `None` if depth is registered to the color image.
 fn depth_sensor(camera: &Camera, depth: &Depth, color: &Intrinsics) -> Option<sim::DepthSensor> {
     let camera_from_depth = camera.sim.truth.camera_from_depth.unwrap_or(depth.camera_from_depth);
-    // A true lens of the color images is also that of depth images which are registered to them.
-    let intrinsics = if depth.intrinsics == camera.intrinsics { color } else { &depth.intrinsics };
-    let is_registered = intrinsics == color && camera_from_depth == Transform::identity();
-    (!is_registered).then(|| sim::DepthSensor { intrinsics: intrinsics.clone(), camera_from_depth })
+    // Depth that was resized from the color image's lens has its true lens, too.
+    let size_px = depth.intrinsics.size_px;
+    let shares_lens = depth.intrinsics == camera.intrinsics.resized(size_px);
+    let intrinsics = if shares_lens { color.resized(size_px) } else { depth.intrinsics.clone() };
+    let is_registered = intrinsics == *color && camera_from_depth == Transform::identity();
+    (!is_registered).then_some(sim::DepthSensor { intrinsics, camera_from_depth })
 }

@@ -204,7 +204,10 @@ impl SamplesFile {
             };
             let base_from_flange = transform("base_from_flange", &entry.base_from_flange)?;
             let (name, board) = match (&entry.camera_from_board, &entry.image) {
-                (Some(pose), None) => (number, BoardObservation::Pose(transform("camera_from_board", pose)?)),
+                (Some(pose), None) => {
+                    let pose = transform("camera_from_board", pose)?;
+                    (number.clone(), BoardObservation::Pose(pose))
+                }
                 (None, Some(_)) => {
                     let image = detected.next().expect("one result per image");
                     match image.board {
