@@ -197,8 +197,8 @@ impl TrainingOptions {
         })
     }
 
-    /// Which calibration parameters a live run estimates. Without the flag, these are all that registration can estimate, and
-    /// extrinsics if there is no depth; or none on a software adapter, where training is already slow.
+    /// Which calibration parameters a live run estimates. Without the flag, these are all that registration or features can
+    /// estimate; or none on a software adapter, where training is already slow.
     pub fn refining_live(&self, available: AvailableData, software: bool) -> Result<RefineSettings, Error> {
         if !self.refine.is_empty() || software {
             return self.refining(available, Refine::None);
