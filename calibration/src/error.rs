@@ -38,7 +38,7 @@ pub enum Error {
     },
     /// Images differ in size.
     #[error(
-        "images have different sizes: {first} is {}x{}, {other} is {}x{}; calibrate each resolution on its own, from images of one camera",
+        "images have different sizes: {first} is {}x{}, {other} is {}x{}; calibrate each camera and each resolution separately",
         first_px[0], first_px[1], other_px[0], other_px[1]
     )]
     MixedImageSizes {
@@ -77,7 +77,7 @@ pub enum Error {
     },
     /// Too few images show the target.
     #[error(
-        "{n_images} images with a usable target, expected at least {min_images}; take 10 to 20 images with the target in all parts of the image, tilted in different directions"
+        "{n_images} images with a usable target, expected at least {min_images}; take 15 to 20 images with the target in all parts of the image, tilted in different directions"
     )]
     TooFewImages {
         /// Number of usable images.
@@ -131,7 +131,7 @@ pub enum Error {
         why: String,
     },
     /// The measurements do not determine the result, or a mistake in them explains why they disagree.
-    #[error("refused: {0}")]
+    #[error("calibration refused: {0}")]
     Refused(Box<Refusal>),
 }
 

@@ -155,7 +155,7 @@ pub enum NotDetected {
         min: u32,
     },
     /// Nothing like the target is in the image.
-    #[error("no {target} found in the image; is all of it in view, in focus and evenly lit?")]
+    #[error("no {target} found in the image; check that it is in view, in focus and evenly lit")]
     Nothing {
         /// What was searched for.
         target: &'static str,
@@ -177,7 +177,7 @@ pub enum NotDetected {
         expected: Counts,
     },
     /// The markers belong to another dictionary.
-    #[error("found {n} markers of {found}, expected {expected}; use {found} in the target")]
+    #[error("found {n} markers of {found}, expected {expected}; specify {found} as the dictionary of the target")]
     OtherDictionary {
         /// Dictionary of the markers in the image.
         found: String,
@@ -218,7 +218,7 @@ pub enum NotDetected {
     },
     /// The code of a PuzzleBoard cannot be read.
     #[error(
-        "found a board with {found} inner corners, but its code does not match this puzzleboard ({wrong_percent} % of the bits differ)"
+        "found a board with {found} inner corners, but its code does not match the target ({wrong_percent} % of the bits differ); check the number of squares"
     )]
     Code {
         /// Columns and rows found.

@@ -90,7 +90,7 @@ pub(super) fn check_uncertainty(
     let worst = |first: usize| {
         let eigen = SymmetricEigen::new(covariance.fixed_view::<3, 3>(first, first).into_owned());
         let ix = eigen.eigenvalues.imax();
-        (eigen.eigenvalues[ix].max(0.0).sqrt(), eigen.eigenvectors.column(ix).into_owned())
+        (sigma_of(eigen.eigenvalues[ix]), eigen.eigenvectors.column(ix).into_owned())
     };
     let ((sigma_rad, rotation_axis), (sigma_m, direction)) = (worst(0), worst(3));
     // Written so that NaN is refused.
@@ -133,6 +133,12 @@ pub(super) fn axis_name(axis: &Vector3<f64>, body: &str) -> String {
 fn other_axes(axis: &Vector3<f64>, body: &str) -> String {
     let pair = [["y", "z"], ["x", "z"], ["x", "y"]][axis.iamax()];
     format!("its {} or {} axis", pair[0], pair[1]).replace("its", &format!("the {body}'s"))
+}
+
+/// The standard deviation of a variance; infinite if the variance is NaN or negative beyond rounding errors.
+pub(crate) fn sigma_of(variance: f64) -> f64 {
+    const ROUNDING: f64 = 1e-15;
+    if variance >= -ROUNDING { variance.max(0.0).sqrt() } else { f64::INFINITY }
 }
 
 #[cfg(test)]

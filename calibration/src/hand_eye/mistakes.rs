@@ -4,7 +4,7 @@ use super::closed_form::{self, ClosedForm};
 use super::consensus::{self, Consensus};
 use super::refusal::Refusal;
 use super::samples::Sample;
-use super::{BoardObservation, HandEyeSample, Setup};
+use super::{BoardObservation, HandEyeInput, HandEyeSample, Setup};
 use kinematics::Transform;
 
 /// Positions of a robot or distances of a board in meters do not exceed this; in millimeters they do.
@@ -33,7 +33,7 @@ pub(super) fn check_magnitudes(samples: &[HandEyeSample]) -> Result<(), Refusal>
         if median > MAX_POSITION_M {
             return Err(Refusal::new(
                 format!(
-                    "the positions of {name} have a typical size of {median:.1}; meters are expected, and these look like millimeters"
+                    "the median norm of the positions of {name} is {median:.1} m, expected at most {MAX_POSITION_M} m; they are probably in millimeters"
                 ),
                 format!("divide the positions of {name} by 1000"),
             ));
@@ -43,7 +43,7 @@ pub(super) fn check_magnitudes(samples: &[HandEyeSample]) -> Result<(), Refusal>
 }
 
 /// The mistake that explains why the samples disagree. `None` if they agree or no known mistake explains it.
-pub(super) fn explain(setup: Setup, samples: &[Sample], consensus: Option<&Consensus>) -> Option<Refusal> {
+pub(super) fn explain(input: &HandEyeInput<'_>, samples: &[Sample], consensus: Option<&Consensus>) -> Option<Refusal> {
     /// A calibrated camera predicts the board within this fraction of its distance.
     const GOOD_FRAC: f64 = 0.02;
     let distances: Vec<f64> =
@@ -55,13 +55,25 @@ pub(super) fn explain(setup: Setup, samples: &[Sample], consensus: Option<&Conse
     } else {
         "no hand-eye transform explains three of the samples".to_owned()
     };
+    let has_poses = samples.iter().all(|sample| sample.candidates.iter().all(|candidate| candidate.corners.is_none()));
     if let Some(scale) = scale_mistake(samples, consensus) {
         return Some(Refusal::new(format!("{residual}, and {}", scale.0), scale.1));
     }
     if found_m <= GOOD_FRAC * distance_m {
-        return None;
+        // If both poses of each sample are inverted, the samples agree on the inverse of another transform.
+        let is_behind = |sample: &&Sample| sample.candidates[0].camera_from_board.translation.z <= 0.0;
+        let n_behind = samples.iter().filter(is_behind).count();
+        let is_inverted = input.options.board_is_seen && has_poses && 5 * n_behind > 4 * samples.len();
+        return is_inverted.then(|| {
+            Refusal::new(
+                format!(
+                    "the board is behind the camera in {n_behind} of {} samples: the given matrices are board_from_camera",
+                    samples.len()
+                ),
+                "invert the board poses, and check that the robot poses are base_from_flange",
+            )
+        });
     }
-    let has_poses = samples.iter().all(|sample| sample.candidates.iter().all(|candidate| candidate.corners.is_none()));
     // Inverting either transform swaps the unknowns, so the data cannot tell which one was inverted.
     let variant: Vec<Sample> =
         samples.iter().map(|sample| Sample { a: sample.a.inverse(), ..sample.clone() }).collect();
@@ -70,7 +82,7 @@ pub(super) fn explain(setup: Setup, samples: &[Sample], consensus: Option<&Conse
         return None;
     }
     let fits = format!("{residual}; they agree within {:.1} mm if", 1e3 * variant_m);
-    let other = match setup {
+    let other = match input.setup {
         Setup::EyeInHand => "eye to hand",
         Setup::EyeToHand => "eye in hand",
     };

@@ -28,6 +28,7 @@ mod tests;
 pub use closed_form::ClosedForm;
 pub(crate) use closed_form::nearest_rotation;
 pub use evaluation::Scatter;
+pub(crate) use excitation::sigma_of;
 pub use next_poses::{NextPose, NextPoseOptions, suggest_next_poses};
 pub use pose_fit::HandEyeNoise;
 pub use refusal::Refusal;
@@ -92,6 +93,8 @@ pub struct HandEyeOptions {
     pub estimate_intrinsics: bool,
     /// Estimates offsets of the joints except the first and the last. Needs corners, joint values and a chain.
     pub estimate_joint_offsets: bool,
+    /// Whether the second poses are those of a board that a camera sees, so that it must be in front of the camera.
+    pub board_is_seen: bool,
     /// Refuses a result with a larger standard deviation of the position along any direction, meters.
     pub max_sigma_m: f64,
     /// Refuses a result with a larger standard deviation of the rotation around any axis, radians.
@@ -103,6 +106,7 @@ impl Default for HandEyeOptions {
         Self {
             estimate_intrinsics: false,
             estimate_joint_offsets: false,
+            board_is_seen: true,
             max_sigma_m: 0.01,
             max_sigma_rad: 1.0_f64.to_radians(),
         }
@@ -155,7 +159,7 @@ pub fn calibrate_hand_eye(input: &HandEyeInput<'_>) -> Result<HandEyeCalibration
         return Err(refused(too_few(samples.len(), "have a usable view of the board")));
     }
     let consensus = consensus::find(&samples);
-    if let Some(refusal) = mistakes::explain(input.setup, &samples, consensus.as_ref()) {
+    if let Some(refusal) = mistakes::explain(input, &samples, consensus.as_ref()) {
         return Err(refused(refusal));
     }
     let Some(consensus) = consensus else {
@@ -181,7 +185,7 @@ pub fn calibrate_hand_eye(input: &HandEyeInput<'_>) -> Result<HandEyeCalibration
 
 fn too_few(n: usize, what: &str) -> Refusal {
     Refusal::new(
-        format!("{n} samples {what}; at least {MIN_SAMPLES} are needed, and 10 to 20 are recommended"),
+        format!("{n} samples {what}; at least {MIN_SAMPLES} are needed, and 12 or more are recommended"),
         "add poses that rotate the flange by at least 20 degrees around different axes",
     )
 }
@@ -236,12 +240,47 @@ fn check(input: &HandEyeInput<'_>) -> Result<(), Error> {
         let Some(chain) = input.chain else {
             return invalid("joint offsets need the chain of the arm (a URDF)".to_owned());
         };
+        const MIN_JOINTS: usize = 3;
+        if chain.n_joints() < MIN_JOINTS {
+            return invalid(format!(
+                "joint offsets need at least {MIN_JOINTS} joints; the chain has {}",
+                chain.n_joints()
+            ));
+        }
         for sample in &input.samples {
             let joints = sample.joints.as_deref().unwrap_or_default();
             if let Err(error) = chain.forward(joints) {
                 return invalid(format!("sample {:?}: {error}", sample.name));
             }
         }
+        check_joints(&input.samples, chain)?;
     }
     Ok(())
+}
+
+/// Rejects joint values that do not explain the motion of the flange.
+fn check_joints(samples: &[HandEyeSample], chain: &Chain) -> Result<(), Error> {
+    /// Offsets of the joints move the flange less than this.
+    const MAX_ROTATION_RAD: f64 = 0.1;
+    let median_angle = |factor: f64| {
+        let tip_from_flange = |sample: &HandEyeSample| {
+            let joints: Vec<f64> = sample.joints.iter().flatten().map(|value| factor * value).collect();
+            Some((chain.forward(&joints).ok()?.inverse() * sample.base_from_flange).rotation)
+        };
+        let rotations: Vec<_> = samples.iter().filter_map(tip_from_flange).collect();
+        let angles: Vec<f64> = rotations.iter().map(|rotation| rotation.angle_to(&rotations[0])).collect();
+        kinematics::quantile::median(&angles).unwrap_or(0.0)
+    };
+    let found = median_angle(1.0);
+    if found < MAX_ROTATION_RAD {
+        return Ok(());
+    }
+    let hint = match median_angle(std::f64::consts::PI / 180.0) < MAX_ROTATION_RAD {
+        true => "they are in degrees, and must be in radians",
+        false => "check the order of the joints and the link of the flange",
+    };
+    let degrees = found.to_degrees();
+    Err(Error::HandEyeInput {
+        why: format!("the joints and base_from_flange disagree by {degrees:.0} degrees (median); {hint}"),
+    })
 }

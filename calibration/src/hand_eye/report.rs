@@ -2,6 +2,7 @@
 
 use super::closed_form::ClosedForm;
 use super::evaluation::{self, Scatter};
+use super::excitation::sigma_of;
 use super::geometry;
 use super::mistakes;
 use super::pose_fit::{self, HandEyeNoise, Measurement};
@@ -104,7 +105,7 @@ pub(super) fn report(
     let scatter = evaluation::scatter(&boards.collect::<Vec<_>>()).ok_or_else(internal)?;
     let held_out = HeldOut::new(input, refined, &measurements);
     let covariance = position_first(&refined.covariance.fixed_view::<6, 6>(0, 0).into_owned());
-    let sigma = |first: usize| [0, 1, 2].map(|axis| covariance[(first + axis, first + axis)].max(0.0).sqrt());
+    let sigma = |first: usize| [0, 1, 2].map(|axis| sigma_of(covariance[(first + axis, first + axis)]));
     let samples = sample_reports(input, refined, without_board);
     Ok(HandEyeCalibration {
         setup: input.setup,

@@ -2,7 +2,7 @@
 
 use super::stream::Stream;
 use crate::Error;
-use crate::hand_eye::{Refusal, nearest_rotation};
+use crate::hand_eye::{Refusal, nearest_rotation, sigma_of};
 use crate::least_squares::{self, BlockSums, Fit, Loss};
 use nalgebra::{DMatrix, DVector, Matrix3, UnitQuaternion, Vector3};
 
@@ -225,7 +225,7 @@ impl<'a> Orientations<'a> {
         // Correction for the parameters that the parts share.
         let correction = n_parts / (n_parts - 1.0 - 0.5 * n as f64).max(1.0);
         let covariance = &inverse * (scatter * correction) * &inverse;
-        (0..n).map(|ix| covariance[(ix, ix)].max(0.0).sqrt()).collect()
+        (0..n).map(|ix| sigma_of(covariance[(ix, ix)])).collect()
     }
 }
 

@@ -114,7 +114,7 @@ pub fn estimate_time_offset(
     if (offset_secs - coarse.offset_secs).abs() > 10.0 * coarse.step_secs {
         return Err(refused(Refusal::new(
             format!(
-                "the offset of the rotation rates ({:.3} s) and that of the orientations ({offset_secs:.3} s) disagree",
+                "the offsets from rotation rates ({:.3} s) and from orientations ({offset_secs:.3} s) disagree",
                 coarse.offset_secs
             ),
             "check that both streams are poses of the bodies (reference_from_body), not their inverses",
@@ -224,7 +224,7 @@ fn body_transform(
         intrinsics: None,
         board_symmetries: &[],
         chain: None,
-        options: HandEyeOptions::default(),
+        options: HandEyeOptions { board_is_seen: false, ..HandEyeOptions::default() },
     };
     match calibrate_hand_eye(&input) {
         Ok(found) => Ok(Ok(BodyTransform {
@@ -234,7 +234,14 @@ fn body_transform(
             scatter: found.scatter,
         })),
         Err(Error::Refused(refusal)) => {
-            let named = |text: &str| text.replace("flange", "body A");
+            let names = [
+                ("base_from_flange", "stream A"),
+                ("camera_from_board", "the inverse of stream B"),
+                ("the flange", "body A"),
+                ("flange", "body A"),
+                ("the board", "stream B"),
+            ];
+            let named = |text: &str| names.iter().fold(text.to_owned(), |text, (from, to)| text.replace(from, to));
             Ok(Err(Refusal { why: named(&refusal.why), axis: refusal.axis, motion: named(&refusal.motion) }))
         }
         Err(error) => Err(error),

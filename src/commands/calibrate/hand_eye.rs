@@ -2,11 +2,11 @@
 
 use super::lens::LensFile;
 use super::{images, matrix_of, target_argument, transform_of};
-use crate::exit::{BadArgument, Exit, InsufficientData};
+use crate::exit::{self, BadArgument, Exit, InsufficientData};
 use crate::print;
 use anyhow::Context;
 use calibration::hand_eye::{
-    BoardObservation, HandEyeCalibration, HandEyeInput, HandEyeOptions, HandEyeSample, Refusal, SampleStatus, Setup,
+    BoardObservation, HandEyeCalibration, HandEyeInput, HandEyeOptions, HandEyeSample, SampleStatus, Setup,
     calibrate_hand_eye,
 };
 use kinematics::Chain;
@@ -21,7 +21,7 @@ pub(crate) struct Args {
     /// Samples as JSON
     ///
     /// {"intrinsics": {"focal_px": [fx, fy], "principal_px": [cx, cy], "distortion": [...]}, "target":
-    /// "charuco:5x7:34mm:28mm:6X6_250", "setup": "eye-in-hand", "samples": [{"base_from_flange": [[4x4]], "image":
+    /// "charuco:5x7:34mm:26mm:5X5_100", "setup": "eye-in-hand", "samples": [{"base_from_flange": [[4x4]], "image":
     /// "0.png"}, ...]}. Instead of an image, a sample may contain the pose of the board, "camera_from_board"; then
     /// intrinsics and target are not needed. "setup" may be "eye-to-hand": the camera is fixed and the board moves with
     /// the flange. Lengths in meters, matrices row by row, image files relative to this file.
@@ -30,7 +30,7 @@ pub(crate) struct Args {
     /// Also estimate the intrinsics, starting from those in the file; needs images
     #[arg(long)]
     with_intrinsics: bool,
-    /// Also estimate offsets of the joints between the first and the last; needs images, "joints" in the samples, and
+    /// Also estimate the offsets of all joints except the first and the last; needs images, "joints" in the samples,
     /// --urdf and --tip
     #[arg(long, requires_all = ["urdf", "tip"])]
     with_joints: bool,
@@ -74,13 +74,13 @@ type Matrix = [[f64; 4]; 4];
 #[derive(Debug, Default, Serialize)]
 struct Printed {
     #[serde(skip_serializing_if = "Option::is_none")]
-    flange_from_camera: Option<Matrix>,
+    flange_from_camera: Option<Option<Matrix>>,
     #[serde(skip_serializing_if = "Option::is_none")]
-    base_from_camera: Option<Matrix>,
+    base_from_camera: Option<Option<Matrix>>,
     #[serde(skip_serializing_if = "Option::is_none")]
-    base_from_board: Option<Matrix>,
+    base_from_board: Option<Option<Matrix>>,
     #[serde(skip_serializing_if = "Option::is_none")]
-    flange_from_board: Option<Matrix>,
+    flange_from_board: Option<Option<Matrix>>,
     scatter_mm: Option<f64>,
     scatter_deg: Option<f64>,
     held_out_scatter_mm: Option<f64>,
@@ -101,15 +101,18 @@ struct Printed {
 #[derive(Debug, Serialize)]
 struct PrintedJoint {
     joint: String,
-    /// Offset to add to the readings, radians or meters; null if it cannot be observed.
+    /// Offset to add to the readings, radians (meters for prismatic joints); null if it cannot be observed.
     offset: Option<f64>,
     sigma: Option<f64>,
 }
 
-#[derive(Debug, Serialize)]
+#[derive(Debug, Default, Serialize)]
 struct PrintedSample {
     name: String,
     status: &'static str,
+    /// Why the target was not found in its image.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    reason: Option<String>,
     position_mm: Option<f64>,
     rotation_deg: Option<f64>,
     rms_px: Option<f64>,
@@ -119,28 +122,26 @@ struct PrintedSample {
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let file = SamplesFile::read(&args.samples)?;
     let setup = file.setup()?;
-    let target = file.target.as_deref().map(target_argument).transpose().map_err(BadArgument)?;
-    let samples = file.samples(&args.samples, target.as_ref(), args.json)?;
-    let symmetries = target.as_ref().map(TargetSpec::symmetry).unwrap_or_default();
-    let chain = args.chain()?;
-    let input = HandEyeInput {
-        setup,
-        samples: samples.used,
-        intrinsics: file.intrinsics.as_ref().map(LensFile::intrinsics).transpose()?,
-        board_symmetries: &symmetries,
-        chain: chain.as_ref(),
-        options: HandEyeOptions {
-            estimate_intrinsics: args.with_intrinsics,
-            estimate_joint_offsets: args.with_joints,
-            ..HandEyeOptions::default()
-        },
+    let mut unused = Vec::new();
+    let result = args.calibrate(&file, setup, &mut unused);
+    let printed = match result {
+        Ok(printed) => printed,
+        Err(error) if exit::of(&error) == Exit::InsufficientData => {
+            let mut reason = format!("{error:#}");
+            if let Some(first) = unused.first() {
+                let first_reason = first.reason.as_deref().unwrap_or_default();
+                let (n, n_all) = (unused.len(), file.samples.len());
+                reason =
+                    format!("{reason}; {n} of {n_all} images do not show the target: {}: {first_reason}", first.name);
+            }
+            if !args.json {
+                return Err(InsufficientData(reason).into());
+            }
+            Printed::refused(setup, reason)
+        }
+        Err(error) => return Err(error),
     };
-    let printed = match calibrate_hand_eye(&input) {
-        Ok(calibration) => printed(&calibration),
-        Err(calibration::Error::Refused(refusal)) if args.json => refused(&refusal),
-        Err(error) => return Err(error.into()),
-    };
-    let printed = Printed { samples: printed.samples.into_iter().chain(samples.unused).collect(), ..printed };
+    let printed = Printed { samples: printed.samples.into_iter().chain(unused).collect(), ..printed };
     let exit = if printed.refused.is_some() { Exit::InsufficientData } else { Exit::Done };
     if args.json {
         print::json(&printed)?
@@ -151,6 +152,31 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
 }
 
 impl Args {
+    /// Samples whose image does not show the target are added to `unused`.
+    fn calibrate(&self, file: &SamplesFile, setup: Setup, unused: &mut Vec<PrintedSample>) -> anyhow::Result<Printed> {
+        let target = file.target.as_deref().map(target_argument).transpose().map_err(BadArgument)?;
+        let samples = file.samples(&self.samples, target.as_ref(), self.json, unused)?;
+        let symmetries = target.as_ref().map(TargetSpec::symmetry).unwrap_or_default();
+        let chain = self.chain()?;
+        let intrinsics = match (&file.intrinsics, samples.size_px) {
+            (Some(lens), Some(size_px)) => Some(lens.intrinsics(size_px)?),
+            _ => None,
+        };
+        let input = HandEyeInput {
+            setup,
+            samples: samples.used,
+            intrinsics,
+            board_symmetries: &symmetries,
+            chain: chain.as_ref(),
+            options: HandEyeOptions {
+                estimate_intrinsics: self.with_intrinsics,
+                estimate_joint_offsets: self.with_joints,
+                ..HandEyeOptions::default()
+            },
+        };
+        Ok(printed(&calibrate_hand_eye(&input)?))
+    }
+
     fn chain(&self) -> anyhow::Result<Option<Chain>> {
         let (Some(urdf), Some(tip)) = (&self.urdf, &self.tip) else { return Ok(None) };
         let of_file = || urdf.display().to_string();
@@ -161,11 +187,11 @@ impl Args {
     }
 }
 
-/// Samples of the file.
+/// Samples of the file that can be used.
 struct Samples {
     used: Vec<HandEyeSample>,
-    /// Samples whose image does not show the target.
-    unused: Vec<PrintedSample>,
+    /// Size of the images, if there are any.
+    size_px: Option<[u32; 2]>,
 }
 
 impl SamplesFile {
@@ -182,20 +208,27 @@ impl SamplesFile {
         }
     }
 
-    fn samples(&self, path: &Path, target: Option<&TargetSpec>, is_hidden: bool) -> anyhow::Result<Samples> {
+    fn samples(
+        &self,
+        path: &Path,
+        target: Option<&TargetSpec>,
+        is_hidden: bool,
+        unused: &mut Vec<PrintedSample>,
+    ) -> anyhow::Result<Samples> {
         let with_image = self.samples.iter().filter_map(|sample| sample.image.as_ref());
         let folder = path.parent().unwrap_or(Path::new(""));
         let files: Vec<PathBuf> = with_image.map(|image| folder.join(image)).collect();
         let mut detected = match (files.is_empty(), target) {
             (true, _) => Vec::new(),
-            (false, Some(target)) => images::detect(&files, target, is_hidden)?,
+            (false, Some(target)) => images::detect(&files, target, is_hidden),
             (false, None) => return Err(BadArgument(format!("{}: images need a \"target\"", path.display())).into()),
         }
         .into_iter();
         if !files.is_empty() && self.intrinsics.is_none() {
             return Err(BadArgument(format!("{}: images need \"intrinsics\"", path.display())).into());
         }
-        let mut samples = Samples { used: Vec::new(), unused: Vec::new() };
+        let mut samples = Samples { used: Vec::new(), size_px: None };
+        let mut first_image: Option<(String, [u32; 2])> = None;
         for (ix, entry) in self.samples.iter().enumerate() {
             let number = format!("sample {ix}");
             let transform = |key: &str, value: &serde_json::Value| {
@@ -211,15 +244,30 @@ impl SamplesFile {
                 (None, Some(_)) => {
                     let image = detected.next().expect("one result per image");
                     match image.board {
-                        Ok(view) => (image.name, BoardObservation::View(view)),
+                        Ok(board) => {
+                            let size_px = board.size_px;
+                            let (first, first_px) = first_image.get_or_insert((image.name.clone(), size_px)).clone();
+                            if first_px != size_px {
+                                let other = image.name;
+                                return Err(calibration::Error::MixedImageSizes {
+                                    first,
+                                    first_px,
+                                    other,
+                                    other_px: size_px,
+                                }
+                                .into());
+                            }
+                            samples.size_px = Some(size_px);
+                            (image.name, BoardObservation::View(board.view))
+                        }
                         Err(reason) => {
                             log::warn!("{}: not used: {reason}", image.name);
-                            samples.unused.push(PrintedSample {
+                            let reason = Some(reason);
+                            unused.push(PrintedSample {
                                 name: image.name,
                                 status: "no-board",
-                                position_mm: None,
-                                rotation_deg: None,
-                                rms_px: None,
+                                reason,
+                                ..PrintedSample::default()
                             });
                             continue;
                         }
@@ -232,7 +280,7 @@ impl SamplesFile {
             };
             samples.used.push(HandEyeSample { name, base_from_flange, board, joints: entry.joints.clone() });
         }
-        if samples.used.is_empty() && !samples.unused.is_empty() {
+        if samples.used.is_empty() && !unused.is_empty() {
             return Err(InsufficientData(format!("{}: no image shows the target", path.display())).into());
         }
         Ok(samples)
@@ -242,7 +290,7 @@ impl SamplesFile {
 fn printed(calibration: &HandEyeCalibration) -> Printed {
     let camera = Some(matrix_of(&calibration.parent_from_camera));
     let board = Some(matrix_of(&calibration.parent_from_board));
-    let of_setup = |setup: Setup, matrix: Option<Matrix>| matrix.filter(|_| calibration.setup == setup);
+    let of_setup = |setup: Setup, matrix: Option<Matrix>| (calibration.setup == setup).then_some(matrix);
     let held_out = calibration.held_out_scatter;
     Printed {
         flange_from_camera: of_setup(Setup::EyeInHand, camera),
@@ -272,6 +320,7 @@ fn printed(calibration: &HandEyeCalibration) -> Printed {
             .iter()
             .map(|sample| PrintedSample {
                 name: sample.name.clone(),
+                reason: None,
                 status: match sample.status {
                     SampleStatus::Used => "used",
                     SampleStatus::Outlier => "outlier",
@@ -287,8 +336,19 @@ fn printed(calibration: &HandEyeCalibration) -> Printed {
     }
 }
 
-fn refused(refusal: &Refusal) -> Printed {
-    Printed { refused: Some(refusal.to_string()), ..Printed::default() }
+impl Printed {
+    /// Without a result.
+    fn refused(setup: Setup, reason: String) -> Self {
+        let of_setup = |other: Setup| (setup == other).then_some(None);
+        Self {
+            flange_from_camera: of_setup(Setup::EyeInHand),
+            base_from_board: of_setup(Setup::EyeInHand),
+            base_from_camera: of_setup(Setup::EyeToHand),
+            flange_from_board: of_setup(Setup::EyeToHand),
+            refused: Some(reason),
+            ..Self::default()
+        }
+    }
 }
 
 fn describe(printed: &Printed) -> anyhow::Result<()> {
@@ -299,7 +359,7 @@ fn describe(printed: &Printed) -> anyhow::Result<()> {
         ("flange_from_board", printed.flange_from_board),
     ];
     for (name, matrix) in matrices {
-        let Some(matrix) = matrix else { continue };
+        let Some(Some(matrix)) = matrix else { continue };
         print::line(format!("{name}, row by row (meters):"))?;
         for row in matrix {
             let row: Vec<String> = row.iter().map(|value| format!("{value:10.6}")).collect();
@@ -327,7 +387,7 @@ fn describe(printed: &Printed) -> anyhow::Result<()> {
     for joint in &printed.joint_offsets {
         print::line(match (joint.offset, joint.sigma) {
             (Some(offset), Some(sigma)) => {
-                format!("offset of {}: {:.4} +- {:.4} degrees", joint.joint, offset.to_degrees(), sigma.to_degrees())
+                format!("offset of {}: {offset:.6} +- {sigma:.6} (radians or meters)", joint.joint)
             }
             _ => format!("offset of {}: cannot be observed", joint.joint),
         })?;

@@ -13,13 +13,19 @@ use targets::{Detection, GrayImage, TargetSpec};
 pub(super) struct DetectedImage {
     /// Name of the file.
     pub(super) name: String,
+    /// The target, or the reason why it was not found.
+    pub(super) board: Result<Board, String>,
+}
+
+/// The target in an image of known size.
+#[derive(Debug)]
+pub(super) struct Board {
     pub(super) size_px: [u32; 2],
-    /// The corners, or the reason why they were not found.
-    pub(super) board: Result<BoardView, String>,
+    pub(super) view: BoardView,
 }
 
 /// Extensions of the image files in a folder that are read.
-const EXTENSIONS: [&str; 4] = ["jpg", "jpeg", "png", "JPG"];
+const EXTENSIONS: [&str; 3] = ["jpg", "jpeg", "png"];
 
 /// The image files in a folder, in order of their names.
 pub(super) fn files(folder: &Path) -> anyhow::Result<Vec<PathBuf>> {
@@ -27,7 +33,9 @@ pub(super) fn files(folder: &Path) -> anyhow::Result<Vec<PathBuf>> {
     let mut files = Vec::new();
     for entry in std::fs::read_dir(folder).with_context(in_folder)? {
         let path = entry.with_context(in_folder)?.path();
-        if path.extension().is_some_and(|extension| EXTENSIONS.iter().any(|known| extension == *known)) {
+        let is_known =
+            |extension: &std::ffi::OsStr| EXTENSIONS.iter().any(|known| extension.eq_ignore_ascii_case(known));
+        if path.extension().is_some_and(is_known) {
             files.push(path);
         }
     }
@@ -38,36 +46,38 @@ pub(super) fn files(folder: &Path) -> anyhow::Result<Vec<PathBuf>> {
     Ok(files)
 }
 
-/// Detects a target in image files, on all processors. `is_hidden`: no progress bar.
-pub(super) fn detect(files: &[PathBuf], target: &TargetSpec, is_hidden: bool) -> anyhow::Result<Vec<DetectedImage>> {
+/// Detects a target in image files, on all processors; the results are in the order of the files. `is_hidden`: no
+/// progress bar.
+pub(super) fn detect(files: &[PathBuf], target: &TargetSpec, is_hidden: bool) -> Vec<DetectedImage> {
     let bar = print::bar(Some(files.len() as u64), "{bar:30} {pos} of {len} images", is_hidden);
     let next = AtomicUsize::new(0);
-    let detect_next = || {
+    let detect_some = || {
         let mut detected = Vec::new();
-        while let Some(path) = files.get(next.fetch_add(1, Ordering::Relaxed)) {
-            detected.push((path.clone(), detect_in(path, target)));
+        loop {
+            let ix = next.fetch_add(1, Ordering::Relaxed);
+            let Some(path) = files.get(ix) else { return detected };
+            let name = path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned();
+            let board = detect_in(path, &name, target).map_err(|error| format!("{error:#}"));
+            detected.push((ix, DetectedImage { name, board }));
             bar.inc(1);
         }
-        detected
     };
     let n_threads = std::thread::available_parallelism().map_or(1, |n| n.get().min(files.len()));
     let mut detected: Vec<_> = std::thread::scope(|scope| {
-        let threads: Vec<_> = (0..n_threads).map(|_| scope.spawn(detect_next)).collect();
+        let threads: Vec<_> = (0..n_threads).map(|_| scope.spawn(detect_some)).collect();
         threads.into_iter().flat_map(|thread| thread.join().expect("detection does not panic")).collect()
     });
     bar.finish_and_clear();
-    detected.sort_by(|(a, _), (b, _)| a.cmp(b));
+    detected.sort_by_key(|(ix, _)| *ix);
     detected.into_iter().map(|(_, image)| image).collect()
 }
 
-fn detect_in(path: &Path, target: &TargetSpec) -> anyhow::Result<DetectedImage> {
+fn detect_in(path: &Path, name: &str, target: &TargetSpec) -> anyhow::Result<Board> {
     let read = || anyhow::Ok(image::ImageReader::open(path)?.with_guessed_format()?.decode()?.into_luma8());
-    let gray = read().with_context(|| format!("cannot read the image {}", path.display()))?;
+    let gray = read().context("cannot read the image")?;
     let size_px = [gray.width(), gray.height()];
-    let name = path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned();
-    let board = target.detect(GrayImage { size_px, pixels: gray.as_raw() });
-    let board = board.map(|detection| view(&name, &detection)).map_err(|error| error.to_string());
-    Ok(DetectedImage { name, size_px, board })
+    let detection = target.detect(GrayImage { size_px, pixels: gray.as_raw() })?;
+    Ok(Board { size_px, view: view(name, &detection) })
 }
 
 fn view(name: &str, detection: &Detection) -> BoardView {

@@ -19,7 +19,7 @@ pub(crate) struct Args {
     /// Folder of images (.jpg, .png) of the target, all of one camera and one size
     #[arg(value_name = "IMAGES")]
     folder: PathBuf,
-    /// The target, such as chessboard:9x6:25mm, charuco:5x7:34mm:28mm:6X6_250 or aprilgrid:6x6:88mm:0.3
+    /// The target, such as chessboard:9x6:25mm, charuco:5x7:34mm:26mm:5X5_100 or aprilgrid:6x6:20mm:0.3
     #[arg(long, value_name = "SPEC", value_parser = target_argument)]
     target: TargetSpec,
     /// Lens model
@@ -99,13 +99,13 @@ struct PrintedTrial<'a> {
 
 /// Detects the target, calibrates, and prints the result.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
-    let detected = images::detect(&images::files(&args.folder)?, &args.target, args.json)?;
+    let detected = images::detect(&images::files(&args.folder)?, &args.target, args.json);
     let (mut views, mut sizes_px, mut rejected) = (Vec::<BoardView>::new(), Vec::new(), Vec::new());
-    for DetectedImage { name, size_px, board } in detected {
+    for DetectedImage { name, board } in detected {
         match board {
-            Ok(view) => {
-                views.push(view);
-                sizes_px.push(size_px);
+            Ok(board) => {
+                views.push(board.view);
+                sizes_px.push(board.size_px);
             }
             Err(reason) => rejected.push(PrintedRejection { image: name, reason }),
         }
@@ -114,7 +114,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         // All images usually fail for the same reason.
         let reason = rejected.first().map_or(String::new(), |first| format!("; {}: {}", first.image, first.reason));
         let text = format!(
-            "{}: {} was detected in none of {} images{reason}",
+            "{}: {} was not detected in any of {} images{reason}",
             args.folder.display(),
             args.target,
             rejected.len()
@@ -204,7 +204,7 @@ fn describe(printed: &Printed<'_>) -> anyhow::Result<()> {
     }
     let sigmas = printed.projection_sigma_px.values.iter().flatten();
     let worst = sigmas.fold(0.0f64, |worst, sigma| worst.max(*sigma));
-    print::line(format!("projection       within {worst:.2} px everywhere (standard deviation at the worst place)"))?;
+    print::line(format!("projection       +- {worst:.2} px (largest standard deviation in the image)"))?;
     for rejection in rejected {
         print::line(format!("not used: {}: {}", rejection.image, rejection.reason))?;
     }

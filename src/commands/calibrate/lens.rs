@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 pub(super) struct LensFile {
     /// `pinhole`, `brown_conrady` (five or eight coefficients) or `kannala_brandt`, as in rig files; by default, pinhole
     /// without distortion coefficients, and `brown_conrady` with them.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[serde(default, alias = "lens", skip_serializing_if = "Option::is_none")]
     pub(super) model: Option<String>,
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub(super) size_px: Option<[u32; 2]>,
@@ -41,12 +41,25 @@ impl LensFile {
         }
     }
 
-    /// The intrinsics. Without a size, the image is assumed to be symmetric about the principal point.
-    pub(super) fn intrinsics(&self) -> Result<Intrinsics, BadArgument> {
-        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a number of pixels, clamped")]
-        let size = |axis: usize| (2.0 * self.principal_px[axis]).round().clamp(1.0, 1e5) as u32;
+    /// The intrinsics for images of the given size.
+    pub(super) fn intrinsics(&self, size_px: [u32; 2]) -> Result<Intrinsics, BadArgument> {
+        let [width, height] = size_px;
+        if let Some(own) = self.size_px.filter(|own| *own != size_px) {
+            return Err(BadArgument(format!(
+                "the intrinsics are for images of {}x{} pixels, but the images have {width}x{height}; calibrate this resolution",
+                own[0], own[1]
+            )));
+        }
+        // The principal point of a lens is near the center of its images.
+        const CENTRAL_FRAC: std::ops::RangeInclusive<f64> = 0.25..=0.75;
+        if (0..2).any(|axis| !CENTRAL_FRAC.contains(&(self.principal_px[axis] / f64::from(size_px[axis])))) {
+            return Err(BadArgument(format!(
+                "principal_px {:?} is far from the center of images of {width}x{height} pixels; the intrinsics are probably for another resolution",
+                self.principal_px
+            )));
+        }
         let intrinsics = Intrinsics {
-            size_px: self.size_px.unwrap_or_else(|| [size(0), size(1)]),
+            size_px,
             focal_px: self.focal_px,
             principal_px: self.principal_px,
             lens: self.lens()?,
@@ -59,8 +72,7 @@ impl LensFile {
     fn lens(&self) -> Result<Lens, BadArgument> {
         let k = &self.distortion;
         let default = if k.is_empty() { PINHOLE } else { BROWN_CONRADY };
-        // Results of `calibrate intrinsics` may list the coefficients after the name.
-        let model = self.model.as_deref().and_then(|model| model.split_whitespace().next()).unwrap_or(default);
+        let model = self.model.as_deref().unwrap_or(default);
         let too_many = |max: usize| {
             BadArgument(format!("intrinsics: {} distortion coefficients; {model} has at most {max}", k.len()))
         };

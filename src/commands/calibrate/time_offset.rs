@@ -24,7 +24,7 @@ pub(crate) struct Args {
     /// Also estimate the transform between the bodies
     #[arg(long)]
     hand_eye: bool,
-    /// Search only for offsets up to S seconds [default: the length of the streams]
+    /// Largest absolute offset to search, seconds [default: all offsets at which the streams overlap]
     #[arg(long, value_name = "S", value_parser = super::super::number_in_range(0.001..=1e9))]
     max_offset: Option<f64>,
     /// Print one JSON object
@@ -41,6 +41,8 @@ struct Printed {
     /// Rate of the clock of A relative to that of B, minus 1, in parts per million; null if it is not significant.
     drift_ppm: Option<f64>,
     drift_sigma_ppm: Option<f64>,
+    /// Time on the clock of B at which `offset_secs` holds, if there is a drift.
+    mid_secs: Option<f64>,
     /// Pose of the second body in the frame of the first, row by row.
     #[serde(skip_serializing_if = "Option::is_none")]
     a_from_b: Option<[[f64; 4]; 4]>,
@@ -88,6 +90,7 @@ impl Printed {
             sigma_secs: Some(offset.sigma_secs),
             drift_ppm: offset.drift_ppm.map(|[drift, _]| drift),
             drift_sigma_ppm: offset.drift_ppm.map(|[_, sigma]| sigma),
+            mid_secs: Some(offset.mid_secs),
             a_from_b: bodies.map(|bodies| matrix_of(&bodies.a_body_from_b_body)),
             sigma_mm: bodies.map(|bodies| bodies.sigma_mm),
             sigma_deg: bodies.map(|bodies| bodies.sigma_deg),
@@ -113,11 +116,13 @@ fn read(path: &Path) -> anyhow::Result<Vec<PoseSample>> {
         })?;
         const MAX_NORM_ERROR: f64 = 0.01;
         let quaternion = Quaternion::new(qw, qx, qy, qz);
-        if !((quaternion.norm() - 1.0).abs() < MAX_NORM_ERROR && [secs, x, y, z].iter().all(|value| value.is_finite()))
-        {
-            let text =
-                format!("{}: the quaternion qx,qy,qz,qw has the norm {:.3}, expected 1", place(), quaternion.norm());
-            return Err(BadArgument(text).into());
+        if ![secs, x, y, z].iter().all(|value| value.is_finite()) {
+            return Err(BadArgument(format!("{}: t, x, y and z must be finite", place())).into());
+        }
+        // Written so that NaN is an error.
+        if !((quaternion.norm() - 1.0).abs() < MAX_NORM_ERROR) {
+            let norm = quaternion.norm();
+            return Err(BadArgument(format!("{}: |qx,qy,qz,qw| is {norm:.3}, expected 1", place())).into());
         }
         let pose = Transform::from_parts(Translation3::new(x, y, z), UnitQuaternion::from_quaternion(quaternion));
         samples.push(PoseSample { secs, pose });

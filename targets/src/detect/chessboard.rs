@@ -113,11 +113,15 @@ fn matching(lattice: &mut Lattice, inner: [u32; 2], plane: &Plane) -> Result<Lat
         // The square at the upper left of the board's first corner is black. Without rotation, it is the one that
         // the grid counts as upper left, and colors alternate. Rotations by 90 degrees look at another square.
         let is_black = (corner[0] + corner[1] + turns).rem_euclid(2) == 0;
-        (!is_odd || is_black).then_some((turns, corner))
+        (!is_odd || is_black).then_some((is_black, turns, corner))
     });
-    let oriented = oriented.map(|(turns, corner)| renumber(lattice, corner, turns as usize));
+    let oriented: Vec<_> =
+        oriented.map(|(is_black, turns, corner)| (is_black, renumber(lattice, corner, turns as usize))).collect();
+    // A square board with an odd number of corners per side changes colors with every rotation by 90 degrees.
+    let has_black = oriented.iter().any(|(is_black, _)| *is_black);
     let from_right = |lattice: &Lattice| x_axis_rad(lattice).map_or(f64::INFINITY, f64::abs);
-    let best = oriented.min_by(|a, b| from_right(a).total_cmp(&from_right(b)));
+    let candidates = oriented.into_iter().filter(|(is_black, _)| *is_black || !has_black).map(|(_, lattice)| lattice);
+    let best = candidates.min_by(|a, b| from_right(a).total_cmp(&from_right(b)));
     best.ok_or(NotDetected::Nothing { target: "chessboard" })
 }
 

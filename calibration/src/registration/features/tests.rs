@@ -1,6 +1,7 @@
 use super::*;
 use crate::scenes::{Miscalibration, capture, remaining, wrong_extrinsics};
 use kinematics::random::Random;
+use nalgebra::Vector3;
 
 const EXTRINSICS: ParamSet = ParamSet::EXTRINSICS;
 
