@@ -194,6 +194,27 @@ fn first_corner_is_next_to_a_black_square_in_every_rotation() {
 }
 
 #[test]
+fn square_boards_are_numbered_up_to_their_symmetry() {
+    let target: TargetSpec = "chessboard:7x7:25mm".parse().unwrap();
+    assert_eq!(target.symmetry().len(), 2);
+    for quarter in 0..4 {
+        let view = view(&target, [0.1, 0.2, f64::from(quarter) * std::f64::consts::FRAC_PI_2 + 0.1], 0.7, 1.0);
+        let detection = detect(&target, &target, &view).unwrap();
+        let truth = truth(&target, &view);
+        let n = target.n_corners();
+        let max_error = |id_of: &dyn Fn(u32) -> u32| {
+            let of_corner = |corner: &targets::DetectedCorner| {
+                let (_, pixel) = truth.iter().find(|(id, _)| *id == id_of(corner.id)).expect("all corners are visible");
+                (corner.pixel[0] - pixel[0]).hypot(corner.pixel[1] - pixel[1])
+            };
+            detection.corners.iter().map(of_corner).fold(0.0, f64::max)
+        };
+        let max = max_error(&|id| id).min(max_error(&|id| n - 1 - id));
+        assert!(max < 0.2, "quarter turn {quarter}: off by {max} px");
+    }
+}
+
+#[test]
 fn mistakes_are_explained() {
     for (wanted, seen, expected) in [
         ("chessboard:9x6:25mm", "chessboard:8x6:25mm", "found a board with 8x6 inner corners, expected 9x6"),

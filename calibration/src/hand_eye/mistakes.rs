@@ -121,7 +121,7 @@ fn scale_mistake(samples: &[Sample], consensus: Option<&Consensus>) -> Option<(S
     let motions = closed_form::motions(&pairs);
     let rotation = ClosedForm::ParkMartin.solve(&motions)?.rotation;
     let (scale, sigma) = closed_form::relative_scale(&motions, rotation)?;
-    if scale.is_nan() || scale <= 0.0 || (scale - 1.0).abs() < MIN_CHANGE.max(MIN_SIGMAS * sigma) {
+    if scale.is_nan() || scale == 0.0 || (scale - 1.0).abs() < MIN_CHANGE.max(MIN_SIGMAS * sigma) {
         return None;
     }
     // The scale must explain the disagreement.
@@ -129,20 +129,26 @@ fn scale_mistake(samples: &[Sample], consensus: Option<&Consensus>) -> Option<(S
     for candidate in scaled.iter_mut().flat_map(|sample| &mut sample.candidates) {
         candidate.camera_from_board.translation.vector *= scale;
     }
-    let explained_m = consensus::find(&scaled)?.median_m() / scale.max(1.0);
+    let explained_m = consensus::find(&scaled)?.median_m() / scale.abs().max(1.0);
     if explained_m * BETTER > consensus.map_or(f64::INFINITY, Consensus::median_m) {
         return None;
     }
     let near = |expected: f64| (scale / expected - 1.0).abs() < 0.1;
-    Some(if near(1000.0) {
+    Some(if near(-1.0) {
         (
-            "the positions of the robot are 1000 times too large for those of the board: millimeters instead of meters"
+            "the board moves mirrored relative to the robot: the images are flipped, or the target was printed mirrored"
+                .to_owned(),
+            "turn off mirroring in the camera, or print the target again".to_owned(),
+        )
+    } else if near(1000.0) {
+        (
+            "the positions of the robot are 1000 times too large relative to those of the board: they are probably in millimeters"
                 .to_owned(),
             "divide the positions of base_from_flange by 1000".to_owned(),
         )
     } else if near(0.001) {
         (
-            "the positions of the board are 1000 times too large for those of the robot: millimeters instead of meters"
+            "the positions of the board are 1000 times too large relative to those of the robot: they are probably in millimeters"
                 .to_owned(),
             "divide the positions of camera_from_board, or the size of the board, by 1000".to_owned(),
         )

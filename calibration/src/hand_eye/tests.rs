@@ -168,6 +168,20 @@ fn mistakes_are_named() {
     assert!(robot_inverted.contains("base_from_flange is inverted"), "{robot_inverted}");
     let board_inverted = with(&|sample| board(sample, &|pose| pose.inverse()));
     assert!(board_inverted.contains("camera_from_board is inverted"), "{board_inverted}");
+    let both_inverted = with(&|sample| {
+        sample.base_from_flange = sample.base_from_flange.inverse();
+        board(sample, &|pose| pose.inverse());
+    });
+    assert!(both_inverted.contains("behind the camera"), "{both_inverted}");
+    // Poses of a chessboard in images that are flipped along x.
+    let mirrored = with(&|sample| {
+        board(sample, &|pose| {
+            let [x, y, z]: [f64; 3] = pose.translation.vector.into();
+            let axis = pose.rotation.scaled_axis();
+            Transform::new(Vector3::new(-x, y, z), Vector3::new(axis.x, -axis.y, -axis.z))
+        });
+    });
+    assert!(mirrored.contains("mirrored"), "{mirrored}");
     let squares = with(&|sample| board(sample, &scaled(1.2)));
     assert!(squares.contains("size of the squares"), "{squares}");
 }

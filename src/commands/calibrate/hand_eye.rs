@@ -6,26 +6,31 @@ use crate::exit::{self, BadArgument, Exit, InsufficientData};
 use crate::print;
 use anyhow::Context;
 use calibration::hand_eye::{
-    BoardObservation, HandEyeCalibration, HandEyeInput, HandEyeOptions, HandEyeSample, SampleStatus, Setup,
-    calibrate_hand_eye,
+    BoardObservation, HandEyeCalibration, HandEyeInput, HandEyeOptions, HandEyeSample, NextPose, NextPoseOptions,
+    SampleStatus, Setup, calibrate_hand_eye, suggest_next_poses,
 };
 use kinematics::Chain;
 use kinematics::urdf::Robot;
+use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 use targets::TargetSpec;
 
+/// Format of the samples file.
+const SAMPLES_HELP: &str = r#"Samples as JSON:
+
+{"intrinsics": {"focal_px": [fx, fy], "principal_px": [cx, cy], "distortion": [...]},
+ "target": "charuco:5x7:34mm:26mm:5X5_100", "setup": "eye-in-hand",
+ "samples": [{"base_from_flange": [[4x4]], "image": "0.png"}, ...]}
+
+Instead of an image, a sample may contain the pose of the board, "camera_from_board"; then intrinsics and target are not
+needed. With the setup "eye-to-hand", the camera is fixed and the board moves with the flange. Lengths in meters, matrices
+row by row, pixel centers at +0.5, image files relative to this file."#;
+
 /// Flags of `calibrate hand-eye`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// Samples as JSON
-    ///
-    /// {"intrinsics": {"focal_px": [fx, fy], "principal_px": [cx, cy], "distortion": [...]}, "target":
-    /// "charuco:5x7:34mm:26mm:5X5_100", "setup": "eye-in-hand", "samples": [{"base_from_flange": [[4x4]], "image":
-    /// "0.png"}, ...]}. Instead of an image, a sample may contain the pose of the board, "camera_from_board"; then
-    /// intrinsics and target are not needed. "setup" may be "eye-to-hand": the camera is fixed and the board moves with
-    /// the flange. Lengths in meters, matrices row by row, image files relative to this file.
-    #[arg(value_name = "SAMPLES.json")]
+    #[arg(value_name = "SAMPLES.json", help = "Samples as JSON", long_help = SAMPLES_HELP)]
     samples: PathBuf,
     /// Also estimate the intrinsics, starting from those in the file; needs images
     #[arg(long)]
@@ -94,8 +99,21 @@ struct Printed {
     intrinsics: Option<LensFile>,
     joint_offsets: Vec<PrintedJoint>,
     samples: Vec<PrintedSample>,
+    /// The poses that would lower the uncertainty most.
+    next_poses: Vec<PrintedPose>,
     warnings: Vec<String>,
     refused: Option<String>,
+}
+
+/// A suggested robot pose.
+#[derive(Debug, Serialize)]
+struct PrintedPose {
+    base_from_flange: Matrix,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    joints: Option<Vec<f64>>,
+    motion: String,
+    /// Standard deviations with this pose, relative to those without.
+    sigma_frac: f64,
 }
 
 #[derive(Debug, Serialize)]
@@ -174,7 +192,13 @@ impl Args {
                 ..HandEyeOptions::default()
             },
         };
-        Ok(printed(&calibrate_hand_eye(&input)?))
+        let calibration = calibrate_hand_eye(&input)?;
+        let mut printed = printed(&calibration);
+        if let Some(target) = &target {
+            let next_poses = suggest_next_poses(&input, &calibration, &next_pose_options(target));
+            printed.next_poses = next_poses.into_iter().map(PrintedPose::of).collect();
+        }
+        Ok(printed)
     }
 
     fn chain(&self) -> anyhow::Result<Option<Chain>> {
@@ -184,6 +208,25 @@ impl Args {
         let robot = Robot::parse(&text).with_context(of_file)?;
         let root = robot.root().with_context(of_file)?.to_owned();
         Ok(Some(Chain::new(&robot, &root, tip).with_context(of_file)?))
+    }
+}
+
+impl PrintedPose {
+    fn of(next: NextPose) -> Self {
+        let NextPose { base_from_flange, joints, motion, sigma_frac } = next;
+        Self { base_from_flange: matrix_of(&base_from_flange), joints, motion, sigma_frac }
+    }
+}
+
+fn next_pose_options(target: &TargetSpec) -> NextPoseOptions {
+    const N_POSES: usize = 3;
+    const MAX_TILT_RAD: f64 = 0.7;
+    let [low, high] = target.bounds_m();
+    NextPoseOptions {
+        n_poses: N_POSES,
+        center_in_board: Vector3::new(0.5 * (low[0] + high[0]), 0.5 * (low[1] + high[1]), 0.0),
+        radius_m: 0.5 * (high[0] - low[0]).hypot(high[1] - low[1]),
+        max_tilt_rad: MAX_TILT_RAD,
     }
 }
 
@@ -331,6 +374,7 @@ fn printed(calibration: &HandEyeCalibration) -> Printed {
                 rms_px: sample.rms_px,
             })
             .collect(),
+        next_poses: Vec::new(),
         warnings: calibration.warnings.clone(),
         refused: None,
     }
@@ -394,6 +438,10 @@ fn describe(printed: &Printed) -> anyhow::Result<()> {
     }
     for sample in printed.samples.iter().filter(|sample| sample.status != "used") {
         print::line(format!("not used: {}: {}", sample.name, sample.status))?;
+    }
+    if let Some(next) = printed.next_poses.first() {
+        let percent = 100.0 * (1.0 - next.sigma_frac);
+        print::line(format!("next pose: {} (lowers the standard deviations by {percent:.0} %)", next.motion))?;
     }
     for warning in &printed.warnings {
         log::warn!("{warning}");

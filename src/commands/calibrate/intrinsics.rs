@@ -13,14 +13,16 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 use targets::TargetSpec;
 
+const TARGET_HELP: &str =
+    "The target, such as chessboard:9x6:25mm, charuco:5x7:34mm:26mm:5X5_100 or aprilgrid:6x6:20mm:0.3";
+
 /// Flags of `calibrate intrinsics`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
     /// Folder of images (.jpg, .png) of the target, all of one camera and one size
     #[arg(value_name = "IMAGES")]
     folder: PathBuf,
-    /// The target, such as chessboard:9x6:25mm, charuco:5x7:34mm:26mm:5X5_100 or aprilgrid:6x6:20mm:0.3
-    #[arg(long, value_name = "SPEC", value_parser = target_argument)]
+    #[arg(long, value_name = "SPEC", value_parser = target_argument, help = TARGET_HELP)]
     target: TargetSpec,
     /// Lens model
     #[arg(long, value_name = "MODEL", value_enum, default_value_t = ModelArg::Auto)]

@@ -10,13 +10,14 @@ use targets::{Paper, TargetSpec};
 /// Fits on A4 and letter paper, and can be identified if parts of it are hidden.
 const DEFAULT_TARGET: &str = "charuco:5x7:34mm:26mm:5X5_100";
 
+const TARGET_HELP: &str = "Target to draw: chessboard:9x6:25mm (inner corners, square), charuco:5x7:34mm:26mm:5X5_100 \
+     (squares, square, marker, dictionary), aprilgrid:6x6:20mm:0.3 (tags, tag, gap relative to the tag), \
+     puzzleboard:12x9:20mm (squares, square) or tag:36h11:5:100mm (family, id, side)";
+
 /// Flags of `calibrate target`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// Target to draw: chessboard:9x6:25mm (inner corners, square), charuco:5x7:34mm:26mm:5X5_100 (squares, square,
-    /// marker, dictionary), aprilgrid:6x6:20mm:0.3 (tags, tag, gap relative to the tag), puzzleboard:12x9:20mm
-    /// (squares, square) or tag:36h11:5:100mm (family, id, side)
-    #[arg(long, value_name = "SPEC", default_value = DEFAULT_TARGET, value_parser = target_argument)]
+    #[arg(long, value_name = "SPEC", default_value = DEFAULT_TARGET, value_parser = target_argument, help = TARGET_HELP)]
     target: TargetSpec,
     /// PDF file to write; must not exist
     #[arg(long, value_name = "FILE.pdf")]

@@ -119,9 +119,9 @@ fn read(path: &Path) -> anyhow::Result<Vec<PoseSample>> {
         if ![secs, x, y, z].iter().all(|value| value.is_finite()) {
             return Err(BadArgument(format!("{}: t, x, y and z must be finite", place())).into());
         }
-        // Written so that NaN is an error.
-        if !((quaternion.norm() - 1.0).abs() < MAX_NORM_ERROR) {
-            let norm = quaternion.norm();
+        let norm = quaternion.norm();
+        let is_unit = (norm - 1.0).abs() < MAX_NORM_ERROR; // False for NaN.
+        if !is_unit {
             return Err(BadArgument(format!("{}: |qx,qy,qz,qw| is {norm:.3}, expected 1", place())).into());
         }
         let pose = Transform::from_parts(Translation3::new(x, y, z), UnitQuaternion::from_quaternion(quaternion));
