@@ -39,7 +39,7 @@ pub(crate) struct TrainingArgs {
     /// Calibration parameters to estimate: auto (those that improve validation images), none, or a list of base,
     /// extrinsics, time-offset, joints, depth-pose, lens, depth-scale, readout, image-poses and image-gains, separated
     /// by commas. Images with depth are registered while training runs; without depth, extrinsics, time-offset and
-    /// lens are estimated from matched features, and all parameters are optimized with the scene. base estimates the pose of a mobile base at every station [default: base; on a GPU: auto, but without
+    /// (if listed) lens are estimated from matched features, and all parameters are optimized with the scene. base estimates the pose of a mobile base at every station [default: base; on a GPU: auto, but without
     /// trials in live runs]
     #[arg(long, value_name = "PARAMS", value_delimiter = ',', hide_possible_values = true, value_parser = refine())]
     pub(crate) refine: Vec<Refine>,

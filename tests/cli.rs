@@ -4,8 +4,21 @@ use std::path::Path;
 use std::process::{Command, Output, Stdio};
 
 /// Commands that `fieldrig --help` must list, each with its own help.
-const COMMANDS: [&str; 14] = [
-    "run", "record", "train", "view", "render", "eval", "metrics", "bench", "export", "fk", "devices", "doctor", "sim",
+const COMMANDS: [&str; 15] = [
+    "run",
+    "record",
+    "train",
+    "view",
+    "render",
+    "eval",
+    "metrics",
+    "bench",
+    "calibrate",
+    "export",
+    "fk",
+    "devices",
+    "doctor",
+    "sim",
     "move",
 ];
 

@@ -277,7 +277,7 @@ impl AvailableData {
         let aligned = match self {
             Self { depth: true, .. } => candidates(),
             Self { color_only: true, many_images_per_camera: true, .. } => {
-                vec![ParamSet::EXTRINSICS, ParamSet::TIME_OFFSET, ParamSet::LENS]
+                vec![ParamSet::EXTRINSICS, ParamSet::TIME_OFFSET]
             }
             _ => Vec::new(),
         };
@@ -325,7 +325,7 @@ mod tests {
 
         let candidates = |choice: CameraRefinement| choice.candidates().len();
         for (joints, depth, aligned, learned) in
-            [(true, true, 8, 1), (true, false, 3, 2), (false, true, 8, 2), (false, false, 3, 2)]
+            [(true, true, 8, 1), (true, false, 2, 2), (false, true, 8, 2), (false, false, 2, 2)]
         {
             let RefineSettings { align, with_scene } = refining(&[Refine::Auto], joints, depth).unwrap();
             assert_eq!(

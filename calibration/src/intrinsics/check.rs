@@ -5,12 +5,15 @@ use super::report::{Rejected, RejectionReason};
 use super::robust::MIN_POINTS;
 use crate::least_squares::Fit;
 use crate::{BoardPoint, BoardView, Error};
+use kinematics::quantile::median;
 use nalgebra::Vector3;
 
 /// Minimum number of images: each gives two constraints on focal lengths and principal point.
 pub(super) const MIN_IMAGES: usize = 3;
+/// Images whose corners differ by less, pixels, are repetitions. Counting them as independent would hide the uncertainty.
+const MIN_DISTANCE_PX: f64 = 1.0;
 
-/// Returns the indices of the images with enough points, and rejects the others.
+/// Returns the indices of the images with enough points that do not repeat an earlier image, and rejects the others.
 ///
 /// # Errors
 /// If the sizes differ, a value is not finite, the target is not flat or has an implausible size, or there are too few
@@ -37,15 +40,30 @@ pub(super) fn usable_images(views: &[BoardView], sizes_px: &[[u32; 2]]) -> Resul
     let (mut usable, mut rejected) = (Vec::new(), Vec::new());
     for (ix, view) in views.iter().enumerate() {
         let n_points = view.points.len();
-        if n_points >= MIN_POINTS {
-            usable.push(ix);
-        } else {
-            let reason = RejectionReason::TooFewPoints { n_points, min_points: MIN_POINTS };
-            rejected.push(Rejected { image: view.name.clone(), reason });
-        }
+        let distance_px = |other: &usize| median_distance_px(view, &views[*other]);
+        let same_px = usable.iter().filter_map(distance_px).find(|distance_px| *distance_px < MIN_DISTANCE_PX);
+        let reason = match same_px {
+            _ if n_points < MIN_POINTS => RejectionReason::TooFewPoints { n_points, min_points: MIN_POINTS },
+            Some(distance_px) => RejectionReason::Repeated { distance_px },
+            None => {
+                usable.push(ix);
+                continue;
+            }
+        };
+        rejected.push(Rejected { image: view.name.clone(), reason });
     }
     check_n_images(usable.len())?;
     Ok((usable, rejected))
+}
+
+/// Median distance of the points that two images share, pixels; `None` if they do not share most of them.
+fn median_distance_px(view: &BoardView, other: &BoardView) -> Option<f64> {
+    let distance = |point: &BoardPoint| {
+        let same = other.points.iter().find(|other| other.point_in_board == point.point_in_board)?;
+        Some((point.pixel[0] - same.pixel[0]).hypot(point.pixel[1] - same.pixel[1]))
+    };
+    let distances: Vec<f64> = view.points.iter().filter_map(distance).collect();
+    if 2 * distances.len() < view.points.len() { None } else { median(&distances) }
 }
 
 pub(super) fn check_n_images(n_images: usize) -> Result<(), Error> {

@@ -109,6 +109,11 @@ pub enum RejectionReason {
         /// Minimum number.
         min_points: usize,
     },
+    /// The image repeats an earlier one.
+    Repeated {
+        /// Median distance of the points in the two images, pixels.
+        distance_px: f64,
+    },
     /// No pose of the target explains the points.
     Inconsistent {
         /// Median error of this image, pixels.
@@ -132,6 +137,12 @@ impl std::fmt::Display for RejectionReason {
         match self {
             Self::TooFewPoints { n_points, min_points } => {
                 write!(f, "{n_points} points, expected at least {min_points}")
+            }
+            Self::Repeated { distance_px } => {
+                write!(
+                    f,
+                    "repeats an earlier image: the corners differ by {distance_px:.1} px; move the target or the camera"
+                )
             }
             Self::Inconsistent { median_px, typical_px } => write!(
                 f,

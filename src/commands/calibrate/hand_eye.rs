@@ -1,7 +1,7 @@
 //! `fieldrig calibrate hand-eye`: the pose of a camera on a robot, from images of a target or poses of a board.
 
 use super::lens::LensFile;
-use super::{images, matrix_of, target_argument, transform_of};
+use super::{images, matrix_of, print_matrix, target_argument, transform_of};
 use crate::exit::{self, BadArgument, Exit, InsufficientData};
 use crate::print;
 use anyhow::Context;
@@ -9,8 +9,8 @@ use calibration::hand_eye::{
     BoardObservation, HandEyeCalibration, HandEyeInput, HandEyeOptions, HandEyeSample, NextPose, NextPoseOptions,
     SampleStatus, Setup, calibrate_hand_eye, suggest_next_poses,
 };
-use kinematics::Chain;
 use kinematics::urdf::Robot;
+use kinematics::{Chain, transform};
 use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
@@ -240,7 +240,17 @@ struct Samples {
 impl SamplesFile {
     fn read(path: &Path) -> anyhow::Result<Self> {
         let text = std::fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))?;
-        serde_json::from_str(&text).map_err(|error| BadArgument(format!("{}: {error}", path.display())).into())
+        let invalid = |error: serde_json::Error| BadArgument(format!("{}: {error}", path.display()));
+        let value: serde_json::Value = serde_json::from_str(&text).map_err(invalid)?;
+        let Some(object) = value.as_object() else {
+            return Err(BadArgument(format!("{}: expected an object with \"samples\"", path.display())).into());
+        };
+        const KEYS: [&str; 4] = ["intrinsics", "target", "setup", "samples"];
+        let unknown: Vec<&str> = object.keys().map(String::as_str).filter(|key| !KEYS.contains(key)).collect();
+        if !unknown.is_empty() {
+            log::warn!("{}: unknown keys are ignored: {}", path.display(), unknown.join(", "));
+        }
+        Ok(serde_json::from_value(value).map_err(invalid)?)
     }
 
     fn setup(&self) -> Result<Setup, BadArgument> {
@@ -261,6 +271,11 @@ impl SamplesFile {
         let with_image = self.samples.iter().filter_map(|sample| sample.image.as_ref());
         let folder = path.parent().unwrap_or(Path::new(""));
         let files: Vec<PathBuf> = with_image.map(|image| folder.join(image)).collect();
+        if let Some(missing) = files.iter().find(|file| !file.is_file()) {
+            return Err(
+                BadArgument(format!("{}: the image {} does not exist", path.display(), missing.display())).into()
+            );
+        }
         let mut detected = match (files.is_empty(), target) {
             (true, _) => Vec::new(),
             (false, Some(target)) => images::detect(&files, target, is_hidden),
@@ -304,7 +319,6 @@ impl SamplesFile {
                             (image.name, BoardObservation::View(board.view))
                         }
                         Err(reason) => {
-                            log::warn!("{}: not used: {reason}", image.name);
                             let reason = Some(reason);
                             unused.push(PrintedSample {
                                 name: image.name,
@@ -395,6 +409,14 @@ impl Printed {
     }
 }
 
+/// The value of `parent_from_camera` in a rig file.
+fn pose_toml(matrix: &Matrix) -> anyhow::Result<String> {
+    let pose = transform::from_rows(&std::array::from_fn(|ix| matrix[ix / 4][ix % 4]))?;
+    let list = |values: &[f64]| values.iter().map(|value| format!("{value:.9}")).collect::<Vec<_>>().join(", ");
+    let (xyz_m, quat_xyzw) = (list(pose.translation.vector.as_slice()), list(pose.rotation.coords.as_slice()));
+    Ok(format!("{{ xyz_m = [{xyz_m}], quat_xyzw = [{quat_xyzw}] }}"))
+}
+
 fn describe(printed: &Printed) -> anyhow::Result<()> {
     let matrices = [
         ("flange_from_camera", printed.flange_from_camera),
@@ -405,10 +427,13 @@ fn describe(printed: &Printed) -> anyhow::Result<()> {
     for (name, matrix) in matrices {
         let Some(Some(matrix)) = matrix else { continue };
         print::line(format!("{name}, row by row (meters):"))?;
-        for row in matrix {
-            let row: Vec<String> = row.iter().map(|value| format!("{value:10.6}")).collect();
-            print::line(format!("  {}", row.join(" ")))?;
-        }
+        print_matrix(&matrix)?;
+    }
+    if let Some(Some(matrix)) = printed.flange_from_camera.or(printed.base_from_camera) {
+        print::line(format!("rig file:\nparent_from_camera = {}", pose_toml(&matrix)?))?;
+    }
+    if let Some(intrinsics) = &printed.intrinsics {
+        print::line(format!("intrinsics = {}", intrinsics.to_toml()))?;
     }
     let three = |values: Option<[f64; 3]>, unit: &str| {
         let values = values.unwrap_or_default().map(|value| format!("{value:.3}"));
@@ -437,7 +462,8 @@ fn describe(printed: &Printed) -> anyhow::Result<()> {
         })?;
     }
     for sample in printed.samples.iter().filter(|sample| sample.status != "used") {
-        print::line(format!("not used: {}: {}", sample.name, sample.status))?;
+        let reason = sample.reason.as_deref().unwrap_or(sample.status);
+        print::line(format!("not used: {}: {reason}", sample.name))?;
     }
     if let Some(next) = printed.next_poses.first() {
         let percent = 100.0 * (1.0 - next.sigma_frac);

@@ -29,6 +29,9 @@ const EXTENSIONS: [&str; 3] = ["jpg", "jpeg", "png"];
 
 /// The image files in a folder, in order of their names.
 pub(super) fn files(folder: &Path) -> anyhow::Result<Vec<PathBuf>> {
+    if folder.is_file() {
+        return Err(BadArgument(format!("{} is a file, expected a folder of images", folder.display())).into());
+    }
     let in_folder = || format!("cannot read the folder {}", folder.display());
     let mut files = Vec::new();
     for entry in std::fs::read_dir(folder).with_context(in_folder)? {

@@ -207,6 +207,12 @@ fn describe(printed: &Printed<'_>) -> anyhow::Result<()> {
     let sigmas = printed.projection_sigma_px.values.iter().flatten();
     let worst = sigmas.fold(0.0f64, |worst, sigma| worst.max(*sigma));
     print::line(format!("projection       +- {worst:.2} px (largest standard deviation in the image)"))?;
+    const MAX_SIGMA_FRAC: f64 = 0.01;
+    if worst > MAX_SIGMA_FRAC * f64::from(width) {
+        log::warn!(
+            "the projection is uncertain by {worst:.1} px; add images with the target tilted and near the corners of the image"
+        );
+    }
     for rejection in rejected {
         print::line(format!("not used: {}: {}", rejection.image, rejection.reason))?;
     }

@@ -9,6 +9,7 @@ mod target;
 mod time_offset;
 
 use crate::exit::Exit;
+use crate::print;
 use clap::{Parser, Subcommand};
 use kinematics::{Transform, transform};
 use targets::TargetSpec;
@@ -54,6 +55,15 @@ fn target_argument(text: &str) -> Result<TargetSpec, String> {
 fn matrix_of(transform: &Transform) -> [[f64; 4]; 4] {
     let rows = transform::to_rows(transform);
     std::array::from_fn(|row| std::array::from_fn(|column| rows[4 * row + column]))
+}
+
+/// Prints a matrix row by row.
+fn print_matrix(matrix: &[[f64; 4]; 4]) -> anyhow::Result<()> {
+    for row in matrix {
+        let row: Vec<String> = row.iter().map(|value| format!("{value:10.6}")).collect();
+        print::line(format!("  {}", row.join(" ")))?;
+    }
+    Ok(())
 }
 
 /// The transform of a matrix in JSON: four lists of four numbers, or one list of 16, row by row.

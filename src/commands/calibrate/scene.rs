@@ -1,10 +1,10 @@
 //! `fieldrig calibrate scene`: calibrates the cameras of a rig from images of a static scene.
 
-use super::matrix_of;
+use super::{matrix_of, print_matrix};
 use crate::console::ReadBar;
 use crate::exit::{self, BadArgument, Exit, InsufficientData};
 use crate::{print, signals};
-use calibration::{Estimate, Trial};
+use calibration::{CameraCorrection, Estimate, Trial, rigid_transform};
 use capture::config::{Override, Rig};
 use capture::open::{self, Devices};
 use drivers::Sample;
@@ -54,6 +54,10 @@ struct Printed<'a> {
     n_images: usize,
     /// Calibration after the accepted corrections, by name of the camera; without a rig file, empty.
     cameras: BTreeMap<&'a str, PrintedCamera>,
+    /// For data without a rig file, the pose of each corrected camera in the frame of the given one: multiply each given
+    /// `world_from_camera` by it from the right.
+    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    given_from_corrected: BTreeMap<&'a str, [[f64; 4]; 4]>,
     estimates: &'a [Estimate],
     trials: &'a [Trial],
     /// Directions in parameter space that the motion does not determine.
@@ -77,6 +81,9 @@ struct PrintedCamera {
 
 /// Calibrates and prints the estimates. Exit code 4 if the data do not determine the extrinsics of any camera.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
+    if args.params.len() > 1 && args.params.contains(&Refine::Auto) {
+        return Err(BadArgument("--params: auto cannot be combined with other values".into()).into());
+    }
     let given = args.rig_as_given()?;
     if let Some(file) = &args.write_rig {
         let Some(rig) = &given else {
@@ -90,8 +97,12 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let rig = if args.sim || data.rig.is_none() || !is_rig_file(&args.input) { given } else { data.rig.clone() };
     let calibration = calibrate_scene(&data, &args.params, rig.as_ref())?;
     let exit = exit::from_losses(&data.data_losses);
-    let is_refused = calibration.is_refused(&data);
-    let printed = printed(&data, &calibration, is_refused);
+    let mut printed = printed(&data, &calibration, calibration.is_refused(&data));
+    let alignment = &calibration.alignment;
+    if alignment.estimates.is_empty() && !alignment.has_enough_validation_images() {
+        printed.refused = Some("too few validation images to accept a correction; record more images".to_owned());
+    }
+    let is_refused = printed.refused.is_some();
     if args.json {
         print::json(&printed)?;
     } else {
@@ -183,11 +194,20 @@ fn printed<'a>(data: &Data, calibration: &'a SceneCalibration, is_refused: bool)
     Printed {
         n_images: data.keyframes.len(),
         cameras: cameras.collect(),
+        given_from_corrected: match calibration.rig {
+            Some(_) => BTreeMap::new(),
+            None => alignment.corrections.iter().map(given_from_corrected).collect(),
+        },
         estimates: &alignment.estimates,
         trials: &alignment.trials,
         unobservable: alignment.unobservable.iter().map(ToString::to_string).collect(),
         refused: is_refused.then(|| reasons.collect::<Vec<_>>().join("; ")),
     }
+}
+
+fn given_from_corrected<'a>((camera, correction): (&'a String, &CameraCorrection)) -> (&'a str, [[f64; 4]; 4]) {
+    let corrected_from_given = rigid_transform(correction.rotation_rad.into(), correction.translation_m.into());
+    (camera, matrix_of(&corrected_from_given.inverse()))
 }
 
 fn describe(printed: &Printed<'_>, calibration: &SceneCalibration, is_auto: bool) -> anyhow::Result<()> {
@@ -200,20 +220,20 @@ fn describe(printed: &Printed<'_>, calibration: &SceneCalibration, is_auto: bool
         log::warn!("the corrections are applied as requested, but validation images do not confirm all of them");
     }
     if printed.estimates.is_empty() && printed.refused.is_none() {
-        print::line(match alignment.has_enough_validation_images() {
-            true => "nothing to correct: no parameter improves the prediction of validation images",
-            false => "too few validation images to accept a correction; record more images",
-        })?;
+        print::line("nothing to correct: no parameter improves the prediction of validation images")?;
+    }
+    for (name, matrix) in &printed.given_from_corrected {
+        print::line(format!(
+            "pose of the corrected camera {name} in the given one, row by row; multiply each pose by it from the right:"
+        ))?;
+        print_matrix(matrix)?;
     }
     for (name, camera) in &printed.cameras {
         if let (Some(reason), None) = (&camera.refused, &printed.refused) {
             log::warn!("camera {name:?} keeps its extrinsics: {reason}");
         }
         print::line(format!("parent_from_camera of {name}, row by row ({} images):", camera.n_images))?;
-        for row in &camera.parent_from_camera {
-            let row: Vec<String> = row.iter().map(|value| format!("{value:10.6}")).collect();
-            print::line(format!("  {}", row.join(" ")))?;
-        }
+        print_matrix(&camera.parent_from_camera)?;
     }
     Ok(())
 }

@@ -1,6 +1,6 @@
 //! `fieldrig calibrate time-offset`: the offset between the clocks of two pose streams.
 
-use super::matrix_of;
+use super::{matrix_of, print_matrix};
 use crate::exit::{BadArgument, Exit, InsufficientData};
 use crate::print;
 use anyhow::Context;
@@ -141,10 +141,7 @@ fn describe(printed: &Printed) -> anyhow::Result<()> {
     }
     if let Some(matrix) = printed.a_from_b {
         print::line("a_from_b, row by row (meters):")?;
-        for row in matrix {
-            let row: Vec<String> = row.iter().map(|value| format!("{value:10.6}")).collect();
-            print::line(format!("  {}", row.join(" ")))?;
-        }
+        print_matrix(&matrix)?;
     }
     Ok(())
 }
