@@ -77,7 +77,7 @@ pub enum Error {
     },
     /// Too few images show the target.
     #[error(
-        "{n_images} images with a usable target, expected at least {min_images}; take 15 to 20 images with the target in all parts of the image, tilted in different directions"
+        "{n_images} different images with a usable target, expected at least {min_images}; take 15 to 20 images with the target in all parts of the image, tilted in different directions"
     )]
     TooFewImages {
         /// Number of usable images.

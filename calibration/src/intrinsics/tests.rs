@@ -264,9 +264,24 @@ fn images_without_tilt_are_refused_with_the_remedy() {
         assert!(error.to_string().contains("tilted by 20 to 45 degrees"), "{model:?}: {error}");
     }
     // Many images, all with the same tilt, do not determine the principal point.
-    let same = Transform::new(Vector3::new(-0.1, -0.05, 0.4), Vector3::new(0.6, 0.0, 0.0));
-    let error = calibrate(&camera, &observed_images(&camera, &[same; 9], 0.1, 2), LensModel::Pinhole).unwrap_err();
+    let same_tilt =
+        |ix: u32| Transform::new(Vector3::new(-0.12 + 0.005 * f64::from(ix), -0.05, 0.4), Vector3::new(0.6, 0.0, 0.0));
+    let same: Vec<Transform> = (0..9).map(same_tilt).collect();
+    let error = calibrate(&camera, &observed_images(&camera, &same, 0.1, 2), LensModel::Pinhole).unwrap_err();
     assert!(error.to_string().contains("do not determine"), "{error}");
+}
+
+#[test]
+fn repeated_images_count_once() {
+    let camera = brown_conrady_camera();
+    let once = poses(8, 3);
+    let often: Vec<Transform> = once.iter().chain(&[once[0]; 5]).copied().collect();
+    let found = calibrate(&camera, &observed_images(&camera, &often, 0.1, 20), LensModel::BrownConrady5).unwrap();
+    let n_repeated =
+        found.rejected.iter().filter(|rejected| matches!(rejected.reason, RejectionReason::Repeated { .. })).count();
+    assert_eq!((found.images.len(), n_repeated), (8, 5), "{:?}", found.rejected);
+    let error = calibrate(&camera, &observed_images(&camera, &[once[0]; 6], 0.1, 20), LensModel::Auto).unwrap_err();
+    assert!(matches!(error, Error::TooFewImages { n_images: 1, .. }), "{error}");
 }
 
 #[test]
