@@ -297,9 +297,9 @@ impl DecisionLog {
         self.activity = Activity::Training;
     }
 
-    /// Logs that a checkpoint was taken after this many steps.
+    /// Logs that a checkpoint was taken after this many steps. It is not a decision, so it does not affect which activity
+    /// is logged: a replay takes other checkpoints, and its log must have the same decisions.
     pub fn checkpoint(&mut self, step: u64) {
-        self.log_activity(step);
         self.write(Line::Entry(Entry { step, decision: Decision::Checkpoint(True) }));
     }
 
@@ -520,6 +520,25 @@ mod tests {
         other.rgba_srgb = vec![1, 2, 4, 255].into();
         assert!(!first.matches(&other));
         assert!(text.contains("\"data\":\"scan.mcap\"") && !text.contains("somewhere") && !text.contains("secs\":"));
+    }
+
+    #[test]
+    fn checkpoints_do_not_affect_the_other_entries() {
+        let decisions = |has_checkpoint: bool| -> Vec<String> {
+            let folder = tempfile::tempdir().expect("a folder");
+            let mut log = DecisionLog::create(folder.path(), settings(None)).expect("a log");
+            log.pushed(0, &keyframe(17, Split::Train));
+            log.step_requested();
+            if has_checkpoint {
+                log.checkpoint(50);
+            }
+            log.seeded();
+            log.pushed(50, &keyframe(18, Split::Train));
+            log.end(60).expect("disk space");
+            let text = std::fs::read_to_string(folder.path().join(FILE)).expect("the log");
+            text.lines().filter(|line| !line.contains("\"checkpoint\"")).map(str::to_owned).collect()
+        };
+        assert_eq!(decisions(true), decisions(false));
     }
 
     #[test]
