@@ -1,8 +1,8 @@
 //! Calibration targets: their geometry, detection in gray images, printing to scale.
 //!
 //! A [`TargetSpec`] is parsed from text such as `chessboard:9x6:25mm`, `charuco:5x7:34mm:28mm:6X6_250`,
-//! `aprilgrid:6x6:88mm:0.3`, `puzzleboard:12x9:20mm` or `tag:36h11:5:100mm`. It knows the positions of all corners in
-//! the [board frame](board), finds them in images through any lens, and draws the target.
+//! `aprilgrid:6x6:88mm:0.3`, `puzzleboard:12x9:20mm` or `tag:36h11:5:100mm`. It returns the positions of all
+//! corners in the [board frame](board), detects them in images, and draws the target.
 //!
 //! ```
 //! use targets::{GrayImage, Paper, TargetSpec};
@@ -31,7 +31,8 @@
 //!   contradict the target are rejected (`layout`).
 //! - In the end, every corner is aligned with the printed pattern around it (`template`).
 //!
-//! Only neighboring corners are compared, so lenses may distort the board, and parts may be hidden.
+//! Only neighboring corners are compared, so the lens may distort the board, and parts of it may be hidden. Markers are
+//! decoded through a homography, so strong fisheye distortion reduces the number of detected markers.
 
 mod alignment;
 pub mod board;

@@ -1,7 +1,7 @@
 //! Whether the rotations of the robot determine all parameters.
 //!
 //! A rotation about one axis leaves the position along it and the rotation around it undetermined (Tsai and Lenz 1989,
-//! section III). Errors of the robot poses reach the result divided by the rotation about a second axis.
+//! section III). Errors of the robot poses are amplified by the reciprocal of the rotation about the second axis.
 
 use super::geometry::Solution;
 use super::refusal::Refusal;

@@ -1,10 +1,10 @@
 //! Hand-eye calibration with a target: pose of a camera on the flange or beside the robot.
 //!
 //! [`calibrate_hand_eye`] takes robot poses and, for each, the pose of a board in the camera or its corners in the image.
-//! Closed-form solutions of sample triples give an initial solution that most samples agree with. Generalized least
-//! squares over board poses follow, with noise variances estimated by restricted maximum likelihood. With corners, the
-//! reprojection error is minimized, and each robot pose has a small unknown error. The result has an uncertainty and
-//! leave-one-out errors; input that does not determine the result is refused.
+//! Closed-form solutions of sample triples give an initial solution that most samples agree with. It is
+//! refined from board poses by generalized least squares, with noise variances estimated by restricted maximum
+//! likelihood, or from corners by minimizing the reprojection error, with a small unknown error of each robot pose. The
+//! result has an uncertainty and leave-one-out errors. Input that does not determine the result is refused.
 
 mod closed_form;
 mod consensus;
@@ -77,8 +77,9 @@ pub struct HandEyeInput<'a> {
     pub samples: Vec<HandEyeSample>,
     /// Lens parameters. Needed for corners; initial values if they are estimated.
     pub intrinsics: Option<Intrinsics>,
-    /// Rotations of the board after which it looks the same, `board_from_equivalent_board`: for example a half turn about
-    /// the center of a chessboard with an odd number of squares along both sides. Empty if the board is unique.
+    /// Rotations of the board after which it looks the same, `board_from_equivalent_board`: for example a half turn
+    /// about the center of a chessboard whose numbers of inner corners are both even or both odd. Empty if the
+    /// orientation is unique.
     pub board_symmetries: &'a [Transform],
     /// The arm, for joint offsets.
     pub chain: Option<&'a Chain>,

@@ -1,4 +1,4 @@
-//! Reasons to refuse a calibration: what is not observable, and which motion would make it so.
+//! Reasons to refuse a calibration: unobservable directions or mistakes, and their remedies.
 
 /// Why no calibration is returned although the input is valid.
 #[derive(Clone, Debug, PartialEq)]

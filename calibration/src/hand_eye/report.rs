@@ -22,7 +22,7 @@ pub struct HandEyeCalibration {
     /// `base_from_board` (eye in hand) or `flange_from_board` (eye to hand).
     pub parent_from_board: Transform,
     /// Covariance of `parent_from_camera`: position in meters along the camera's x, y and z axes, then rotation in
-    /// radians around them. `error.dot(inverse(covariance) * error)` stays below 12.59 with a probability of 95 %.
+    /// radians around them. The squared Mahalanobis distance of the error is below 12.59 with a probability of 95 %.
     pub covariance: Matrix6<f64>,
     /// Standard deviations of the position along the camera's axes, millimeters.
     pub sigma_mm: [f64; 3],
@@ -57,8 +57,8 @@ pub struct HandEyeCalibration {
 pub struct JointOffset {
     /// Name of the joint.
     pub joint: String,
-    /// Offset and its standard deviation, radians or meters. `None` if it is not observable: the first joint is
-    /// equivalent to a motion of the board, and the last one to a motion of the camera.
+    /// Offset and its standard deviation, radians or meters. `None` if it is not observable. Offsets of the
+    /// first and the last joint are equivalent to motions of the board and the camera.
     pub estimate: Option<[f64; 2]>,
 }
 

@@ -28,8 +28,8 @@ pub struct IntrinsicsCalibration {
     pub rms_px: f64,
     /// Standard deviation of a detected corner along one axis, estimated from the residuals, pixels.
     pub noise_px: f64,
-    /// How much larger the scatter between images is than independent errors of the corners explain; 1 if they are
-    /// independent. The covariance contains this factor if it is above 1.
+    /// Ratio of the observed variance between images to the variance expected from independent corner errors. The
+    /// covariance is multiplied by this ratio if it is above 1.
     pub dispersion: f64,
     /// The images in use.
     pub images: Vec<ImageFit>,
