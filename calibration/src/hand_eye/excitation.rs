@@ -5,6 +5,7 @@
 
 use super::geometry::Solution;
 use super::refusal::Refusal;
+use crate::least_squares::sigma_of;
 use kinematics::Transform;
 use nalgebra::{DMatrix, Matrix3, SymmetricEigen, Vector3};
 
@@ -133,12 +134,6 @@ pub(super) fn axis_name(axis: &Vector3<f64>, body: &str) -> String {
 fn other_axes(axis: &Vector3<f64>, body: &str) -> String {
     let pair = [["y", "z"], ["x", "z"], ["x", "y"]][axis.iamax()];
     format!("its {} or {} axis", pair[0], pair[1]).replace("its", &format!("the {body}'s"))
-}
-
-/// The standard deviation of a variance; infinite if the variance is NaN or negative beyond rounding errors.
-pub(crate) fn sigma_of(variance: f64) -> f64 {
-    const ROUNDING: f64 = 1e-15;
-    if variance >= -ROUNDING { variance.max(0.0).sqrt() } else { f64::INFINITY }
 }
 
 #[cfg(test)]

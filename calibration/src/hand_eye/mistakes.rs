@@ -74,7 +74,7 @@ pub(super) fn explain(input: &HandEyeInput<'_>, samples: &[Sample], consensus: O
             )
         });
     }
-    // Inverting either transform swaps the unknowns, so the data cannot tell which one was inverted.
+    // Inverting either transform swaps the unknowns, so the data do not determine which one was inverted.
     let variant: Vec<Sample> =
         samples.iter().map(|sample| Sample { a: sample.a.inverse(), ..sample.clone() }).collect();
     let variant_m = consensus::find(&variant)?.median_m();

@@ -28,7 +28,6 @@ mod tests;
 pub use closed_form::ClosedForm;
 pub(crate) use closed_form::nearest_rotation;
 pub use evaluation::Scatter;
-pub(crate) use excitation::sigma_of;
 pub use next_poses::{NextPose, NextPoseOptions, suggest_next_poses};
 pub use pose_fit::HandEyeNoise;
 pub use refusal::Refusal;

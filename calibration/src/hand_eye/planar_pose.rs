@@ -4,13 +4,12 @@
 //! plane-based pose estimation", section 4.3). Both are refined by minimizing the reprojection error.
 
 use super::closed_form::nearest_rotation;
+use crate::intrinsics::homography;
 use crate::least_squares::{self, BlockSums, Loss};
 use crate::{BoardPoint, BoardView};
 use kinematics::random::Random;
 use kinematics::{Intrinsics, Transform};
-use nalgebra::{
-    DMatrix, DVector, Matrix2, Matrix2x3, Matrix3, Matrix6, Rotation3, UnitQuaternion, Vector2, Vector3, Vector6,
-};
+use nalgebra::{DVector, Matrix2, Matrix2x3, Matrix3, Matrix6, Rotation3, UnitQuaternion, Vector2, Vector3, Vector6};
 
 /// Minimum number of corners for a pose.
 pub(super) const MIN_CORNERS: usize = 4;
@@ -117,42 +116,14 @@ impl Plane {
     }
 }
 
-/// Homography from the plane to the plane `z = 1` of the camera, by the normalized linear method (Hartley and Zisserman
-/// 2004, section 4.4), scaled such that the last element is 1. `None` if it is not determined.
+/// Homography from the plane to the plane `z = 1` of the camera, scaled such that the last element is 1. `None` if it is
+/// not determined.
 fn homography(points: &[Vector2<f64>], rays: &[Vector2<f64>], is_used: &[bool]) -> Option<Matrix3<f64>> {
     let used: Vec<(Vector2<f64>, Vector2<f64>)> =
         points.iter().zip(rays).zip(is_used).filter(|(_, used)| **used).map(|((p, r), _)| (*p, *r)).collect();
-    (used.len() >= MIN_CORNERS).then_some(())?;
-    let (from, to) = (normalization(used.iter().map(|pair| pair.0))?, normalization(used.iter().map(|pair| pair.1))?);
-    let mut rows = DMatrix::zeros((2 * used.len()).max(9), 9);
-    for (ix, (point, ray)) in used.iter().enumerate() {
-        let p = from * point.push(1.0);
-        let r = to * ray.push(1.0);
-        for axis in 0..2 {
-            for column in 0..3 {
-                rows[(2 * ix + axis, 3 * axis + column)] = p[column];
-                rows[(2 * ix + axis, 6 + column)] = -r[axis] * p[column];
-            }
-        }
-    }
-    let eigen = (rows.transpose() * rows).symmetric_eigen();
-    let smallest = eigen.eigenvalues.imin();
-    let h = eigen.eigenvectors.column(smallest);
-    let normalized = Matrix3::new(h[0], h[1], h[2], h[3], h[4], h[5], h[6], h[7], h[8]);
-    let matrix = to.try_inverse()? * normalized * from;
+    let matrix = homography::homography(&used)?;
     let scaled = matrix / matrix[(2, 2)];
     scaled.iter().all(|value| value.is_finite()).then_some(scaled)
-}
-
-/// Moves the centroid to the origin and scales the mean distance from it to the square root of 2.
-fn normalization(points: impl Iterator<Item = Vector2<f64>> + Clone) -> Option<Matrix3<f64>> {
-    let n = points.clone().count() as f64;
-    let centroid = points.clone().sum::<Vector2<f64>>() / n;
-    let mean = points.map(|point| (point - centroid).norm()).sum::<f64>() / n;
-    let scale = std::f64::consts::SQRT_2 / mean;
-    scale
-        .is_finite()
-        .then(|| Matrix3::new(scale, 0.0, -scale * centroid.x, 0.0, scale, -scale * centroid.y, 0.0, 0.0, 1.0))
 }
 
 /// Both rotations that the homography allows at the origin of the plane.

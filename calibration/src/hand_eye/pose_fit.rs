@@ -18,7 +18,7 @@ pub struct HandEyeNoise {
     /// and blur are common to the corners of one image; they count as if independent errors of this size caused their
     /// effect on the pose of the board.
     pub corner_px: Option<f64>,
-    /// Residual of the corners after a fit of each image by itself, pixels along each axis. Not larger than `corner_px`.
+    /// Residual of the corners after a separate fit of each image, pixels along each axis. At most `corner_px`.
     pub residual_px: Option<f64>,
     /// Rotation error about each axis, radians: of the robot poses if corners were given, otherwise of the board poses
     /// including the robot's error.

@@ -2,13 +2,13 @@
 
 use super::closed_form::ClosedForm;
 use super::evaluation::{self, Scatter};
-use super::excitation::sigma_of;
 use super::geometry;
 use super::mistakes;
 use super::pose_fit::{self, HandEyeNoise, Measurement};
 use super::refine::{self, Refined};
 use super::{HandEyeInput, Setup};
 use crate::Error;
+use crate::least_squares::sigma_of;
 use kinematics::{Intrinsics, Transform};
 use nalgebra::Matrix6;
 

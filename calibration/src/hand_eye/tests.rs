@@ -137,7 +137,7 @@ fn intrinsics_are_estimated_with_the_hand_eye_transform() {
     }
     let (mm, deg) = errors_of(&found, &scene.parent_from_camera);
     assert!(mm < 0.5 && deg < 0.1, "{mm} mm, {deg} degrees");
-    // With the wrong intrinsics held fixed, the report says so.
+    // With the wrong intrinsics held fixed, the report contains a warning.
     input.options.estimate_intrinsics = false;
     let fixed = calibrate_hand_eye(&input).unwrap();
     assert!(fixed.warnings.iter().any(|warning| warning.contains("intrinsics")), "{:?}", fixed.warnings);

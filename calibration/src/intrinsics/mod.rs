@@ -7,7 +7,7 @@ mod bundle;
 mod check;
 mod coefficients;
 mod grid;
-mod homography;
+pub(crate) mod homography;
 mod initial;
 mod next_view;
 mod report;
@@ -62,7 +62,7 @@ pub enum LensModel {
 ///
 /// # Errors
 /// If the input is malformed, if too few images are usable, if no lens model fits, or if the images do not determine
-/// the focal length or the principal point. The message says what to change.
+/// the focal length or the principal point. The message contains the remedy.
 pub fn calibrate_intrinsics(input: &IntrinsicsInput<'_>) -> Result<IntrinsicsCalibration, Error> {
     let (usable, mut rejected) = check::usable_images(input.views, input.sizes_px)?;
     let images: Vec<&[BoardPoint]> = usable.iter().map(|ix| &input.views[*ix].points[..]).collect();

@@ -44,8 +44,14 @@ pub struct Direction {
 impl<S> Fit<S> {
     /// Standard deviation of a shared parameter.
     pub fn sigma(&self, param_ix: usize) -> f64 {
-        self.covariance[(param_ix, param_ix)].max(0.0).sqrt()
+        sigma_of(self.covariance[(param_ix, param_ix)])
     }
+}
+
+/// The standard deviation of a variance; infinite if the variance is NaN or negative beyond rounding errors.
+pub(crate) fn sigma_of(variance: f64) -> f64 {
+    const TINY: f64 = 1e-15;
+    if variance >= -TINY { variance.max(0.0).sqrt() } else { f64::INFINITY }
 }
 
 /// Relative size of an eigenvalue that cannot be distinguished from zero.

@@ -62,8 +62,8 @@ mod tests {
         for loss in [Loss::Squared, Loss::Huber { threshold: 1.5 }, Loss::Cauchy { threshold: 1.5 }] {
             for norm in [0.3, 1.4, 1.6, 4.0_f64] {
                 let at = |norm: f64| loss.at(norm * norm);
-                let slope = (at(norm + NUDGE).value - at(norm - NUDGE).value) / (2.0 * NUDGE);
-                assert!((slope - 2.0 * norm * at(norm).weight).abs() < CLOSE, "{loss:?} at {norm}");
+                let gradient = (at(norm + NUDGE).value - at(norm - NUDGE).value) / (2.0 * NUDGE);
+                assert!((gradient - 2.0 * norm * at(norm).weight).abs() < CLOSE, "{loss:?} at {norm}");
                 let influence = |norm: f64| norm * at(norm).weight;
                 let radial = (influence(norm + NUDGE) - influence(norm - NUDGE)) / (2.0 * NUDGE);
                 assert!((radial - at(norm).radial_derivative).abs() < CLOSE, "{loss:?} at {norm}");

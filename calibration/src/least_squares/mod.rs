@@ -11,6 +11,7 @@ mod normal_equations;
 #[cfg(test)]
 mod tests;
 
+pub(crate) use fit::sigma_of;
 pub use fit::{Direction, Fit};
 pub use loss::Loss;
 pub use normal_equations::BlockSums;

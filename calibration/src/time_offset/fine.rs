@@ -2,8 +2,8 @@
 
 use super::stream::Stream;
 use crate::Error;
-use crate::hand_eye::{Refusal, nearest_rotation, sigma_of};
-use crate::least_squares::{self, BlockSums, Fit, Loss};
+use crate::hand_eye::{Refusal, nearest_rotation};
+use crate::least_squares::{self, BlockSums, Fit, Loss, sigma_of};
 use nalgebra::{DMatrix, DVector, Matrix3, UnitQuaternion, Vector3};
 
 /// Parameters: rotation vectors of the hand-eye and the reference rotation, offset, drift.

@@ -49,7 +49,7 @@ impl TargetSpec {
     /// depends only on the image. The function can be called from several threads at the same time.
     ///
     /// # Errors
-    /// [`NotDetected`] says what was found instead.
+    /// [`NotDetected`] describes what was found instead.
     pub fn detect(&self, image: GrayImage<'_>) -> Result<Detection, NotDetected> {
         let plane = Plane::new(image)?;
         match &self.pattern {
