@@ -19,6 +19,8 @@ use std::time::{Duration, Instant};
 const STEP_RAD: f64 = 0.05;
 /// Read timeout of the connection. The server sends its status several times per second.
 const MAX_SILENCE: Duration = Duration::from_secs(120);
+/// Time after the connection during which the server may have no picture yet.
+const MAX_START: Duration = Duration::from_secs(2);
 /// Maximum length of a text message; the list of keyframes is the longest.
 const MAX_TEXT_BYTES: u64 = 16 << 20;
 /// Maximum length of the header of a binary message.
@@ -87,6 +89,7 @@ impl Viewer {
             stream: stream.try_clone().context("cannot share a connection")?,
             options,
             pictures: Arc::clone(&pictures),
+            started: Instant::now(),
             n_requested: 0,
             requested: Instant::now(),
             first_stage: None,
@@ -132,6 +135,7 @@ struct Client {
     stream: TcpStream,
     options: ViewerOptions,
     pictures: Arc<Mutex<Vec<ReceivedPicture>>>,
+    started: Instant,
     n_requested: u64,
     /// Time at which the current picture was requested.
     requested: Instant,
@@ -187,8 +191,12 @@ impl Client {
                 self.center_m = Point3::new(number(&center[0])?, number(&center[1])?, number(&center[2])?);
                 self.radius_m = number(&message["radius_m"])?;
             }
-            // The server cannot draw a picture yet.
+            // At first, the server cannot draw a picture yet.
             Some("error") => {
+                let message = message["message"].as_str().unwrap_or("an unknown error");
+                if !self.pictures.lock().is_empty() || self.started.elapsed() > MAX_START {
+                    log::warn!("a viewer received no picture: {message}");
+                }
                 std::thread::sleep(Duration::from_millis(200));
                 self.request_picture()?;
             }

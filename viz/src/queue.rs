@@ -11,7 +11,7 @@ use trainer::Rendered;
 const MAX_UNSENT: usize = 2;
 
 /// If the full picture is expected to take less time than this, coarser stages are skipped.
-const FAST_MILLIS: f64 = 20.0;
+const FAST_MILLIS: f64 = 30.0;
 
 /// All connected clients and their requests.
 #[derive(Debug, Default)]
@@ -253,15 +253,15 @@ mod tests {
             }
             scales
         };
-        assert_eq!(draw(&mut queue, 1, 19.0, |_| ()), [0.1, 0.5, 1.0], "there is no earlier picture");
-        assert_eq!(draw(&mut queue, 2, 21.0, |_| ()), [1.0], "the last one was fast");
+        assert_eq!(draw(&mut queue, 1, 29.0, |_| ()), [0.1, 0.5, 1.0], "there is no earlier picture");
+        assert_eq!(draw(&mut queue, 2, 31.0, |_| ()), [1.0], "the last one was fast");
         assert_eq!(draw(&mut queue, 3, 3.0, |_| ()), [0.1, 0.5, 1.0], "the last one was slow");
         assert_eq!(draw(&mut queue, 4, 3.0, |view_request| view_request.stages = vec![0.5]), [0.5]);
-        assert_eq!(draw(&mut queue, 5, 6.0, |_| ()), [1.0], "four times the pixels in 12 ms");
+        assert_eq!(draw(&mut queue, 5, 8.0, |_| ()), [1.0], "four times the pixels in 12 ms");
         assert_eq!(
             draw(&mut queue, 6, 6.0, |view_request| view_request.request.size_px = [200, 200]),
             [0.1, 0.5, 1.0],
-            "24 ms"
+            "32 ms"
         );
         assert_eq!(
             draw(&mut queue, 7, 1.0, |view_request| view_request.method = Some("nerf".to_owned())),

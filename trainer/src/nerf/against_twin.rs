@@ -5,7 +5,7 @@ use super::buffers::{
 };
 use super::kernels::{FieldPipelines, N_CHUNK, Widths};
 use super::params::{self, AdamRule, Batch, ImageParamRule, RayLoss, Span};
-use super::passes::FieldPasses;
+use super::passes::{Canvas, FieldPasses};
 use super::reference::field::{Field, FieldGrad};
 use super::reference::network::Network;
 use super::reference::pose::ImagePose;
@@ -130,7 +130,7 @@ fn bench(options: &GpuOptions, twin: &Field, rays: &[Ray], scales: &[f32]) -> Be
             ..params::Ray::default()
         });
         let span =
-            |[begin, end]: &[f64; 2]| Span { begin: f32_of(*begin), end: f32_of(*end), ray: embedding, unused: 0 };
+            |[begin, end]: &[f64; 2]| Span { begin: f32_of(*begin), end: f32_of(*end), ray: embedding, sample: 0 };
         spans.extend(ray.spans.iter().map(span));
         let point = |[begin, end]: &[f64; 2]| {
             let at = std::array::from_fn(|axis| ray.origin[axis] + 0.5 * (begin + end) * ray.direction[axis]);
@@ -250,6 +250,47 @@ fn colors_and_gradients_match_twin() {
         }
         mismatches.assert_none();
         assert_eq!(gpu.read::<u32>(&gradients.counts, 1).unwrap(), [0]);
+    }
+}
+
+/// Colors of pictures differ by what the samples between two selected ones add.
+#[test]
+fn pictures_match_twin() {
+    let (twin, rays) = (field(7), rays());
+    for options in gpu_variants() {
+        let bench = bench(&options, &twin, &rays, &vec![1.0; twin.shape.n_cells.len()]);
+        let Bench { gpu, pipelines, widths, field, samples: batch, slot, image_params, .. } = &bench;
+        let passes = FieldPasses { gpu, pipelines, field, samples: batch, slot, image_params };
+        let n_rays = u32::try_from(rays.len()).unwrap();
+        let canvas = Canvas::new(gpu, widths, field.n_entries, n_rays.into(), n_rays, batch.n_samples).unwrap();
+        let n_spans = rays.iter().map(|ray| ray.spans.len()).sum::<usize>();
+        let spans: Vec<Span> = gpu.read(&batch.spans, n_spans).unwrap();
+        let numbered: Vec<Span> = (0..).zip(spans).map(|(sample, span)| Span { sample, ..span }).collect();
+        gpu.write(&batch.spans, 0, bytemuck::cast_slice(&numbered));
+        gpu.write(&canvas.selected, 0, bytemuck::bytes_of(&Batch::of(n_rays)));
+        let march = params::March { max_found: u32::MAX, ..bytemuck::Zeroable::zeroed() };
+        gpu.write(&slot.march, 0, bytemuck::bytes_of(&march));
+        let dark = [[0.0f32, 0.0, 0.0, 1.0], [0.0, 0.0, 1e9, 0.0]];
+        gpu.write(&canvas.light, 0, bytemuck::cast_slice(&vec![dark; rays.len()]));
+        let mut list = Passes::default();
+        passes.convert_for_picture(&mut list, &canvas);
+        passes.select(&mut list, &canvas);
+        passes.picture_colors(&mut list, &canvas);
+        passes.show(&mut list, &canvas);
+        list.submit(gpu);
+
+        let light: Vec<[[f32; 4]; 2]> = gpu.read(&canvas.light, rays.len()).unwrap();
+        let mut mismatches = Mismatches::default();
+        for (ix, (ray, [[red, green, blue, transmittance], [distance, ..]])) in rays.iter().zip(light).enumerate() {
+            let picture = reference::composite(&samples(&twin, ray));
+            for (channel, (got, expected)) in [red, green, blue].into_iter().zip(picture.rgb).enumerate() {
+                mismatches.check(format!("color {ix} {channel}"), got.into(), expected, 0.02, 0.0);
+            }
+            // Rays end at a transmittance of 1/512.
+            mismatches.check(format!("transmittance {ix}"), transmittance.into(), picture.transmittance, 0.002, 0.0);
+            mismatches.check(format!("distance {ix}"), distance.into(), picture.distance, 0.002, 0.002);
+        }
+        mismatches.assert_none();
     }
 }
 

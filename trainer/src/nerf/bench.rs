@@ -90,10 +90,7 @@ pub fn time_steps(gpu: &Gpu, n_rays: u32, n_samples: u32, n_repeats: usize) -> R
     let (step_millis, passes) = timed(&mut field_trainer, &|field_trainer| {
         field_trainer.record_step(gpu, &options, 0, STEP, &rays, ParamSet::empty())
     })?;
-    let (colors_millis, _) = timed(&mut field_trainer, &|field_trainer| {
-        field_trainer.record_colors(gpu);
-        Ok(())
-    })?;
+    let (colors_millis, _) = timed(&mut field_trainer, &|field_trainer| field_trainer.record_colors(gpu))?;
     Ok(StepFigures {
         n_rays,
         n_samples: counters.get(1).copied().unwrap_or(0),

@@ -55,7 +55,7 @@ pub(crate) struct FieldMoments {
 /// Occupancy grid: the cells in which rays are sampled.
 #[derive(Debug)]
 pub(crate) struct Occupancy {
-    /// One bit per cell, then one bit per block of cells.
+    /// Bits of cells, groups and blocks: a set of those to sample, and a set of solid ones; see `cell_blocks.wgsl`.
     pub(crate) occupied: Buffer,
     /// One f32 per cell: its recent opacity over one step; negative: never updated; 0: outside all views.
     pub(crate) cell_occupancy: Buffer,
@@ -65,19 +65,20 @@ pub(crate) struct Occupancy {
     pub(crate) n_cells: u32,
 }
 
-/// Blocks of cells along an axis, as in `cell_blocks.wgsl`.
-pub(crate) fn n_blocks(n_cells: u32) -> u32 {
+/// Words of the bits of all groups and blocks of cells, and of a whole set, as in `cell_blocks.wgsl`.
+pub(crate) fn n_box_words(n_cells: u32) -> u32 {
     const MAX_BLOCKS: u32 = 16;
-    n_cells.min(MAX_BLOCKS)
+    const MAX_GROUPS: u32 = 64;
+    [MAX_GROUPS, MAX_BLOCKS].map(|max| n_cells.min(max).pow(3).div_ceil(32)).iter().sum()
 }
 
 impl Occupancy {
     /// An occupancy grid with all cells marked. With depth, cells count as outside all views until hints arrive.
     pub(crate) fn new(gpu: &Gpu, occupancy_update: &OccupancyUpdate, has_depth: bool) -> Result<Self, Error> {
         let n = occupancy_update.n_cells.pow(3) as usize;
-        let n_words = n / 32 + n_blocks(occupancy_update.n_cells).pow(3).div_ceil(32) as usize;
+        let n_set_words = n.div_ceil(32) + n_box_words(occupancy_update.n_cells) as usize;
         Ok(Self {
-            occupied: gpu.storage_with("nerf.occupied", &vec![255; 4 * n_words.next_multiple_of(4)])?,
+            occupied: gpu.storage_with("nerf.occupied", &vec![255; 4 * (2 * n_set_words).next_multiple_of(4)])?,
             cell_occupancy: gpu.storage_with(
                 "nerf.cell_occupancy",
                 bytemuck::cast_slice(&vec![if has_depth { 0.0f32 } else { -1.0 }; n]),

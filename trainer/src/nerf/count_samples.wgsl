@@ -32,10 +32,12 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
         let ray = rays[ray_ix];
         let path = path_of(march, ray);
         let range = segments_of_thread(path, share);
-        var segment = next_segment(march, ray, path, range.x, range.y);
-        while segment.ix < range.y {
-            n++;
-            segment = next_segment(march, ray, path, segment.ix + 1u, range.y);
+        let boxes = boxes_of(march.n_cells);
+        var segment_ix = range.x;
+        while segment_ix < range.y {
+            let visit = visit(march, boxes, ray, path, segment_ix, range.y, 0u);
+            if visit.is_marked { n++; }
+            segment_ix = visit.next_ix;
         }
     }
     wg_found[lane] = n;

@@ -14,7 +14,7 @@ use super::reference::march as reference;
 use super::sizes::{MAX_LEVELS, MIN_LEVELS, Sizes};
 use crate::gpu::{Buffer, Gpu, PassTiming, Passes, PendingRead, f32_of};
 use crate::model_options::ModelOptions;
-use crate::packing::{LazyPacker, Output};
+use crate::packing::{Output, Reader};
 use crate::view::Camera;
 use crate::{Error, Rendered};
 use calibration::{EMBEDDING_DIM, ParamSet};
@@ -36,9 +36,11 @@ const UPDATED_FRAC: f64 = 0.25;
 const MAX_SAMPLES_OVER_MEAN: u32 = 4;
 /// Samples per round for a ray of a picture; `MAX_SAMPLES_PER_ROUND` of `find_samples.wgsl`.
 const SAMPLES_PER_ROUND: u32 = 8;
-/// Rounds per check for unfinished rays, and maximum number of checks, which limits the length of rays.
-const ROUNDS_PER_SUBMIT: u32 = 4;
-const MAX_SUBMITS: u32 = 64;
+/// Maximum number of rounds, which limits the length of rays; and the number for the first picture.
+const MAX_ROUNDS: u32 = 256;
+const FIRST_ROUNDS: u32 = 16;
+/// Pixels along an axis for one ray that finds where surfaces begin; `FRONT_STRIDE` of `picture_rays.wgsl`.
+const FRONT_STRIDE: u32 = 4;
 /// Initial range of the entries (Mueller et al. 2022, section 4).
 const INITIAL_ENTRY_RANGE: f64 = 1e-4;
 /// Distance residuals beyond this have no gradient, in units of the scene radius.
@@ -77,7 +79,9 @@ pub(crate) struct FieldTrainer {
     slots: Vec<RaySlot>,
     rules: [Buffer; 2],
     picture: Option<(RaySlot, SampleBuffers, Canvas)>,
-    packer: LazyPacker,
+    /// Rounds of samples for the next picture. If its rays need more, it is drawn again.
+    picture_rounds: u32,
+    reader: Reader,
     passes: Passes,
 }
 
@@ -127,7 +131,8 @@ impl FieldTrainer {
                 gpu.uniform_with("nerf.weight_rule", &rule(options, 1e-6)),
             ],
             picture: None,
-            packer: LazyPacker::default(),
+            picture_rounds: FIRST_ROUNDS,
+            reader: Reader::default(),
             passes: Passes::default(),
             field,
             gradients,
@@ -371,11 +376,15 @@ impl FieldTrainer {
         Ok(())
     }
 
-    /// Records the forward pass that pictures use, on the samples of the last step.
-    pub(crate) fn record_colors(&mut self, gpu: &Gpu) {
+    /// Records both networks as pictures use them, with the colors of all samples of the last step.
+    pub(crate) fn record_colors(&mut self, gpu: &Gpu) -> Result<(), Error> {
+        let NerfBudget { n_rays, n_samples, .. } = self.sizes.nerf_budget;
+        let canvas = Canvas::new(gpu, &self.compiled.widths, self.field.n_entries, n_rays.into(), n_rays, n_samples)?;
         let Self { compiled, field, samples, slots, passes: list, .. } = self;
         let image_params = &field.no_image_params;
-        FieldPasses { gpu, pipelines: &compiled.pipelines, field, samples, slot: &slots[0], image_params }.colors(list);
+        FieldPasses { gpu, pipelines: &compiled.pipelines, field, samples, slot: &slots[0], image_params }
+            .all_picture_colors(list, &canvas);
+        Ok(())
     }
 
     /// Submits the recorded passes. The returned read completes when they do.
@@ -456,7 +465,7 @@ impl FieldTrainer {
         radius_m: f64,
         embedding: [f64; EMBEDDING_DIM],
         output: Output,
-    ) -> Result<Rendered, Error> {
+    ) -> Result<Option<Rendered>, Error> {
         let n_pixels = camera.size_px[0] as usize * camera.size_px[1] as usize;
         self.make_canvas(gpu, n_pixels as u64)?;
         let Some((slot, samples, canvas)) = &self.picture else { return Err(Error::DeviceLost) };
@@ -464,29 +473,52 @@ impl FieldTrainer {
         let backdrop = Backdrop { srgb: background_srgb, radius_m: f32_of(radius_m) };
         gpu.write(&canvas.backdrop, 0, bytemuck::bytes_of(&backdrop));
         gpu.write(&canvas.image_params, 0, bytemuck::cast_slice(&image_params_of(&[embedding])));
-        let Self { compiled, field, occupancy, passes: list, sizes, packer, .. } = self;
+        let Self { compiled, field, occupancy, passes: list, sizes, reader, picture_rounds, .. } = self;
         let image_params = &canvas.image_params;
         let picture_passes = FieldPasses { gpu, pipelines: &compiled.pipelines, field, samples, slot, image_params };
-        picture_passes.convert_weights(list);
-        for first in (0..n_pixels).step_by(slot.n_rays as usize) {
-            let n = (n_pixels - first).min(slot.n_rays as usize);
-            let [first_ray, n_rays] = [first, n].map(|ix| u32::try_from(ix).expect("an image's pixels"));
-            let march = March { first_ray, max_found: SAMPLES_PER_ROUND, ..march_of(sizes.nerf_budget) };
-            gpu.write(&slot.march, 0, bytemuck::bytes_of(&march));
-            gpu.write(&samples.batch, 0, bytemuck::bytes_of(&Batch::of(n_rays)));
-            picture_passes.picture_rays(list, canvas);
-            for _ in 0..MAX_SUBMITS {
-                for _ in 0..ROUNDS_PER_SUBMIT {
+        picture_passes.convert_for_picture(list, canvas);
+        let low_px: usize = camera.size_px.map(|px| px.div_ceil(FRONT_STRIDE) as usize).iter().product();
+        let batches_of = |n_pixels: usize, stride: u32| {
+            let firsts = (0..n_pixels).step_by(slot.n_rays as usize);
+            firsts.map(move |first| (first, (n_pixels - first).min(slot.n_rays as usize), stride))
+        };
+        loop {
+            let mut n_batches = 0;
+            for (first, n, stride) in batches_of(low_px, FRONT_STRIDE).chain(batches_of(n_pixels, 1)) {
+                let [first_ray, n_rays] = [first, n].map(|ix| u32::try_from(ix).expect("an image's pixels"));
+                let max_found = SAMPLES_PER_ROUND;
+                let march = March { first_ray, max_found, pixel_stride: stride, ..march_of(sizes.nerf_budget) };
+                gpu.write(&slot.march, 0, bytemuck::bytes_of(&march));
+                for batch in [&samples.batch, &canvas.selected] {
+                    gpu.write(batch, 0, bytemuck::bytes_of(&Batch::of(n_rays)));
+                }
+                picture_passes.picture_rays(list, canvas);
+                for _ in 0..*picture_rounds {
                     picture_passes.find(list, occupancy);
-                    picture_passes.colors(list);
-                    picture_passes.show(list, canvas);
+                    picture_passes.select(list, canvas);
+                    if stride == 1 {
+                        picture_passes.picture_colors(list, canvas);
+                        picture_passes.show(list, canvas);
+                    }
                 }
-                if list.submit_reading(gpu, &[(&samples.batch, 8)]).finish::<u32>(gpu)?[1] == 0 {
-                    break;
+                if stride > 1 {
+                    picture_passes.keep_fronts(list, canvas);
                 }
+                list.copy((&samples.batch, 4), (&canvas.progress, 8 * n_batches), 4);
+                list.copy((&canvas.selected, 8), (&canvas.progress, 8 * n_batches + 4), 4);
+                n_batches += 1;
+                list.submit(gpu); // The next batch overwrites the parameters of this one.
+            }
+            let progress = gpu.read::<[u32; 2]>(&canvas.progress, n_batches as usize)?;
+            let needed = progress.iter().map(|[_, n_rounds]| *n_rounds).max().unwrap_or(0);
+            let is_complete = progress.iter().all(|[n_samples, _]| *n_samples == 0) || *picture_rounds >= MAX_ROUNDS;
+            // Some more rounds for the next picture: without samples, they take little time.
+            *picture_rounds = if is_complete { needed + needed / 4 + 2 } else { 2 * *picture_rounds }.min(MAX_ROUNDS);
+            if is_complete {
+                break;
             }
         }
-        packer.read(gpu, list, output, camera.size_px, [&canvas.pixels, &canvas.depths])
+        reader.read(gpu, list, output, camera.size_px, [&canvas.pixels, &canvas.depths])
     }
 
     fn make_canvas(&mut self, gpu: &Gpu, n_pixels: u64) -> Result<(), Error> {
@@ -497,7 +529,9 @@ impl FieldTrainer {
             self.passes.clear_bindings();
             self.picture = None;
             let samples = SampleBuffers::new(gpu, SAMPLES_PER_ROUND * n_rays)?;
-            self.picture = Some((RaySlot::new(gpu, n_rays)?, samples, Canvas::new(gpu, n_pixels, n_rays)?));
+            let canvas =
+                Canvas::new(gpu, &self.compiled.widths, self.field.n_entries, n_pixels, n_rays, samples.n_samples)?;
+            self.picture = Some((RaySlot::new(gpu, n_rays)?, samples, canvas));
         }
         Ok(())
     }
@@ -561,8 +595,8 @@ fn march_of(nerf_budget: NerfBudget) -> March {
         n_cells: nerf_budget.n_cells,
         first_ray: 0,
         max_found: u32::MAX,
-        unused: 0,
-        unused_2: [0; 2],
+        pixel_stride: 1,
+        unused: [0; 2],
     }
 }
 

@@ -1,7 +1,7 @@
 // find_samples: finds the next samples of the rays of a picture, at most MAX_SAMPLES_PER_ROUND per ray.
 //
 // threads   one per ray
-// reads     march, occupied (one bit per cell)
+// reads     march, occupied (one bit per cell), rays (target_distance: only solid cells are sampled before it)
 // writes    rays (next_segment, first_sample, n_samples), batch (n_samples, zero before), spans, points [n_samples]
 //           (center of the sample, in the unit cube)
 // twin      nerf/reference/march.rs
@@ -32,35 +32,40 @@ struct SampleCounter {
 const MAX_SAMPLES_PER_ROUND = 8u;
 
 var<workgroup> wg_first: u32;
+var<workgroup> wg_segments: array<u32, 2048>; // [MAX_SAMPLES_PER_ROUND, 256], numbers of the segments found
 
 @compute @workgroup_size(256)
 fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
     let ray_ix = folded(wg, n_wgs) * 256u + lane;
-    var segments: array<vec2f, MAX_SAMPLES_PER_ROUND>;
     var n = 0u;
-    var ray: Ray;
-    if ray_ix < batch.n_rays {
-        ray = rays[ray_ix];
-        let path = path_of(march, ray);
-        let end_ix = select(path.n_segments, 0u, ray.is_finished == 1u);
-        var segment = next_segment(march, ray, path, ray.next_segment, end_ix);
-        while segment.ix < end_ix && n < MAX_SAMPLES_PER_ROUND {
-            segments[n] = vec2f(segment.begin, segment.end);
-            n++;
-            rays[ray_ix].next_segment = segment.ix + 1u;
-            if n < MAX_SAMPLES_PER_ROUND { segment = next_segment(march, ray, path, segment.ix + 1u, end_ix); }
+    var path: Path;
+    if ray_ix < batch.n_rays && rays[ray_ix].progress == RAY_RUNNING {
+        let ray = rays[ray_ix];
+        path = path_of(march, ray);
+        var ix = ray.next_segment;
+        let free_ix = segment_at(march, path, ray.target_distance);
+        let boxes = boxes_of(march.n_cells);
+        while ix < path.n_segments && n < MAX_SAMPLES_PER_ROUND {
+            let visit = visit(march, boxes, ray, path, ix, path.n_segments, free_ix);
+            if visit.is_marked {
+                wg_segments[n * 256u + lane] = ix;
+                n++;
+            }
+            ix = visit.next_ix;
         }
+        rays[ray_ix].next_segment = ix;
     }
     var total: u32;
     let below = exclusive_scan(lane, n, &total);
     if lane == 0u { wg_first = atomicAdd(&batch.n_samples, total); }
     let first = workgroupUniformLoad(&wg_first) + below;
-    if ray_ix < batch.n_rays {
-        rays[ray_ix].first_sample = first;
-        rays[ray_ix].n_samples = n;
-        for (var i = 0u; i < n; i++) {
-            spans[first + i] = Span(segments[i].x, segments[i].y, ray_ix, 0u);
-            points[first + i] = vec4f(contract(ray.origin + 0.5 * (segments[i].x + segments[i].y) * ray.direction), 0.0);
-        }
+    if ray_ix >= batch.n_rays || rays[ray_ix].progress != RAY_RUNNING { return; }
+    rays[ray_ix].first_sample = first;
+    rays[ray_ix].n_samples = n;
+    let ray = rays[ray_ix];
+    for (var i = 0u; i < n; i++) {
+        let segment = segment_of(march, ray, path, wg_segments[i * 256u + lane]);
+        spans[first + i] = Span(segment.x, segment.y, ray_ix, first + i);
+        points[first + i] = vec4f(contract(ray.origin + 0.5 * (segment.x + segment.y) * ray.direction), 0.0);
     }
 }

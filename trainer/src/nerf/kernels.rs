@@ -25,17 +25,21 @@ macro_rules! kernel {
 /// Shared sources of the kernels with network layers, for one number type.
 macro_rules! layers {
     ($numbers:literal) => {
+        layers!($numbers, $numbers, "full")
+    };
+    ($numbers:literal, $forward:literal, $entries:literal) => {
         &[
             shared!("folded"),
             shared!("ray_batch"),
             shared!("hash_grid"),
+            shared!("grid_entries", concat!("grid_entries_", $entries)),
             shared!("network_tile"),
             shared!("network_layers"),
             shared!("image_params"),
             shared!("sh"),
             shared!("number", concat!("number_", $numbers)),
             shared!("rows", concat!("rows_", $numbers)),
-            shared!("forward_layer", concat!("forward_layer_", $numbers)),
+            shared!("forward_layer", concat!("forward_layer_", $forward)),
             shared!("backward_layer", concat!("backward_layer_", $numbers)),
         ]
     };
@@ -43,6 +47,9 @@ macro_rules! layers {
 /// Variants with f32 layers, and with f16 cooperative matrices.
 const FULL: &[Source] = layers!("full");
 const HALF: &[Source] = layers!("half");
+/// For pictures: without the rounding errors of the f16 numbers.
+const FULL_PICTURE: &[Source] = layers!("full", "full", "packed");
+const HALF_PICTURE: &[Source] = layers!("half", "single", "packed");
 
 const SHARED: &[Source] = &[
     shared!("folded"),
@@ -56,6 +63,7 @@ const SHARED: &[Source] = &[
     shared!("scan"),
     shared!("view"),
     shared!("picture_ray"),
+    shared!("pixel_order"),
     shared!("occupancy_update"),
     shared!("random"),
     shared!("hash_grid"),
@@ -84,8 +92,13 @@ pub(crate) const KERNELS: &[Kernel] = &[
     kernel!("picture_rays"),
     kernel!("show_rays"),
     kernel!("find_samples"),
+    kernel!("select_samples"),
+    kernel!("keep_fronts"),
     kernel!("field_forward", FULL),
     kernel!("field_forward", HALF),
+    kernel!("field_forward", FULL_PICTURE),
+    kernel!("field_forward", HALF_PICTURE),
+    kernel!("pack_grid"),
     kernel!("composite"),
     kernel!("field_backward", FULL),
     kernel!("field_backward", HALF),
@@ -211,13 +224,18 @@ pub(crate) struct FieldPipelines {
     pub(crate) mark_cells: Pipeline,
     pub(crate) mark_blocks: Pipeline,
     pub(crate) picture_rays: Pipeline,
+    pub(crate) select_samples: Pipeline,
+    pub(crate) keep_fronts: Pipeline,
     pub(crate) show_rays: Pipeline,
-    /// Forward variants: densities only; with colors; and with everything stored for the backward pass.
+    /// Variants of the networks: densities only; densities of a picture, with geometry features stored; colors from
+    /// these features; and both networks with everything stored for the backward pass.
     pub(crate) densities: Pipeline,
-    pub(crate) colors: Pipeline,
+    pub(crate) picture_densities: Pipeline,
+    pub(crate) picture_colors: Pipeline,
     pub(crate) forward: Pipeline,
     /// Only with f16 cooperative matrices.
     pub(crate) weights_to_half: Option<Pipeline>,
+    pub(crate) pack_grid: Pipeline,
     pub(crate) composite: Pipeline,
     pub(crate) field_backward: Pipeline,
     pub(crate) apply_poses: Pipeline,
@@ -245,17 +263,12 @@ impl FieldPipelines {
         ];
         let select_precision = |[full, half]: [Kernel; 2]| if is_half_precision { half } else { full };
         let with = |more: &[(&'static str, f64)]| [&sizes[..], more].concat();
-        let forward = |colors: f64, stores_activations: f64| {
-            let kind = [
-                ("EMBEDDING_DIM", f64::from(embedding_dim)),
-                ("COLORS", colors),
-                ("STORE_ACTIVATIONS", stores_activations),
-            ];
-            Pipeline::new(
-                gpu,
-                select_precision([kernel!("field_forward", FULL), kernel!("field_forward", HALF)]),
-                &with(&kind),
-            )
+        let networks = |[full, half]: [&'static [Source]; 2], enabled: &[&'static str]| {
+            let flag = |name: &'static str| (name, f64::from(u8::from(enabled.contains(&name))));
+            let kind = ["DENSITY", "COLORS", "STORE_ACTIVATIONS", "STORE_GEOMETRY"].map(flag);
+            let kernels = [kernel!("field_forward", full), kernel!("field_forward", half)];
+            let embedding_dim = [("EMBEDDING_DIM", f64::from(embedding_dim))];
+            Pipeline::new(gpu, select_precision(kernels), &with(&[&kind[..], &embedding_dim].concat()))
         };
         // Each thread sums the gradients of 16 weights.
         let max_weights = widths.layers().iter().map(|[n_in, n_out]| n_in * n_out).max().expect("five layers");
@@ -265,21 +278,32 @@ impl FieldPipelines {
         let hint = |kind: f64| Pipeline::new(gpu, kernel!("hint_cells"), &[("KIND", kind)]);
         let plain = |kernel: Kernel| Pipeline::new(gpu, kernel, &[]);
         // These take long to compile, so they are compiled in parallel.
-        let ((densities, colors), (learned, (field_backward, weight_gradients))) = rayon::join(
-            || rayon::join(|| forward(0.0, 0.0), || forward(1.0, 0.0)),
-            || {
-                let backward = || {
-                    let kernel = select_precision([kernel!("field_backward", FULL), kernel!("field_backward", HALF)]);
-                    Pipeline::new(gpu, kernel, &sizes)
-                };
-                let gradients = || {
-                    let kernel =
-                        select_precision([kernel!("weight_gradients"), kernel!("weight_gradients_half", HALF)]);
-                    Pipeline::new(gpu, kernel, &with(&sums))
-                };
-                rayon::join(|| forward(1.0, 1.0), || rayon::join(backward, gradients))
-            },
-        );
+        let pictures = || {
+            rayon::join(
+                || networks([FULL_PICTURE, HALF_PICTURE], &["DENSITY", "STORE_GEOMETRY"]),
+                || networks([FULL_PICTURE, HALF_PICTURE], &["COLORS"]),
+            )
+        };
+        let ((densities, (picture_densities, picture_colors)), (learned, (field_backward, weight_gradients))) =
+            rayon::join(
+                || rayon::join(|| networks([FULL, HALF], &["DENSITY"]), pictures),
+                || {
+                    let backward = || {
+                        let kernel =
+                            select_precision([kernel!("field_backward", FULL), kernel!("field_backward", HALF)]);
+                        Pipeline::new(gpu, kernel, &sizes)
+                    };
+                    let gradients = || {
+                        let kernel =
+                            select_precision([kernel!("weight_gradients"), kernel!("weight_gradients_half", HALF)]);
+                        Pipeline::new(gpu, kernel, &with(&sums))
+                    };
+                    rayon::join(
+                        || networks([FULL, HALF], &["DENSITY", "COLORS", "STORE_ACTIVATIONS"]),
+                        || rayon::join(backward, gradients),
+                    )
+                },
+            );
         Ok(Self {
             count_samples: plain(kernel!("count_samples"))?,
             place_samples: Pipeline::new(gpu, kernel!("place_samples"), &[("CAPACITY", n_samples.into())])?,
@@ -297,10 +321,14 @@ impl FieldPipelines {
                 &[("PICTURE_EMBEDDING_IX", picture_embedding_ix.into())],
             )?,
             show_rays: plain(kernel!("show_rays"))?,
+            select_samples: plain(kernel!("select_samples"))?,
+            keep_fronts: plain(kernel!("keep_fronts"))?,
             densities: densities?,
-            colors: colors?,
+            picture_densities: picture_densities?,
+            picture_colors: picture_colors?,
             forward: learned?,
             weights_to_half: is_half_precision.then(|| plain(kernel!("weights_to_half", HALF))).transpose()?,
+            pack_grid: plain(kernel!("pack_grid"))?,
             composite: plain(kernel!("composite"))?,
             field_backward: field_backward?,
             apply_poses: plain(kernel!("apply_poses"))?,
@@ -353,12 +381,12 @@ mod tests {
                 target_rgb,
                 target_distance,
                 jitter,
-                is_finished,
+                progress,
                 next_segment,
             ]
         );
-        assert_layout!(KERNELS, Span, [begin, end, ray, unused]);
-        assert_layout!(KERNELS, March, [step, max_samples, n_cells, first_ray, max_found, unused, unused_2]);
+        assert_layout!(KERNELS, Span, [begin, end, ray, sample]);
+        assert_layout!(KERNELS, March, [step, max_samples, n_cells, first_ray, max_found, pixel_stride, unused]);
         assert_layout!(KERNELS, OccupancyUpdate, [n_cells, n_points, decay, step]);
         assert_layout!(KERNELS, Backdrop, [srgb, radius_m]);
         assert_layout!(KERNELS, Level, [n_cells, begin, mask, unused]);

@@ -76,8 +76,8 @@ fn samples_lie_in_occupied_cells_within_limit() {
         n_cells: N_CELLS,
         first_ray: 0,
         max_found: u32::MAX,
-        unused: 0,
-        unused_2: [0; 2],
+        pixel_stride: 1,
+        unused: [0; 2],
     };
     gpu.write(&slot.march, 0, bytemuck::bytes_of(&march));
     let image_params = &field.no_image_params;

@@ -13,7 +13,7 @@ use crate::aligned::replacement;
 use crate::checkpoint::PendingCheckpoint;
 use crate::gpu::{Gpu, PassTiming};
 use crate::model_options::ModelOptions;
-use crate::packing::Output;
+use crate::packing::{Format, Output};
 use crate::submits::Submits;
 use crate::view::Camera;
 use crate::{
@@ -245,7 +245,7 @@ impl NerfModel {
         camera: &Camera,
         embedding: [f64; EMBEDDING_DIM],
         output: Output,
-    ) -> Result<Rendered, Error> {
+    ) -> Result<Option<Rendered>, Error> {
         let background_srgb = request.background_srgb;
         let Some((extent, field_trainer)) = &mut self.field else {
             return Ok(Rendered::empty(camera.size_px, background_srgb, output));
@@ -369,7 +369,7 @@ impl Method for NerfModel {
     fn render_packed(&mut self, request: &RenderRequest, packing: Packing) -> Result<Rendered, Error> {
         self.finish_in_flight()?;
         let embedding = self.embedding_of(request.appearance_of.as_ref())?;
-        Rendered::of(request, packing, |camera, output| self.draw(request, camera, embedding, output))
+        Rendered::of(request, Format::Packed(packing), |camera, output| self.draw(request, camera, embedding, output))
     }
 
     fn set_watched(&mut self, watched: bool) {

@@ -34,7 +34,7 @@ pub(crate) struct Ray {
     pub(crate) target_rgb: u32,
     pub(crate) target_distance: f32,
     pub(crate) jitter: f32,
-    pub(crate) is_finished: u32,
+    pub(crate) progress: u32,
     pub(crate) next_segment: u32,
 }
 
@@ -45,7 +45,7 @@ pub(crate) struct Span {
     pub(crate) begin: f32,
     pub(crate) end: f32,
     pub(crate) ray: u32,
-    pub(crate) unused: u32,
+    pub(crate) sample: u32,
 }
 
 /// `March` of `shared/march_params.wgsl`.
@@ -57,8 +57,8 @@ pub(crate) struct March {
     pub(crate) n_cells: u32,
     pub(crate) first_ray: u32,
     pub(crate) max_found: u32,
-    pub(crate) unused: u32,
-    pub(crate) unused_2: [u32; 2],
+    pub(crate) pixel_stride: u32,
+    pub(crate) unused: [u32; 2],
 }
 
 /// `OccupancyUpdate` of `shared/occupancy_update.wgsl`.

@@ -2,10 +2,10 @@
 
 use super::buffers::{
     FieldBuffers, FieldGradients, FieldMoments, ImageParamBuffers, Occupancy, RaySlot, SampleBuffers, StepBuffers,
-    THREADS_PER_RAY, n_blocks,
+    THREADS_PER_RAY, n_box_words,
 };
-use super::kernels::{CHUNK_TILES, FieldPipelines, N_TILE};
-use super::params::{Backdrop, IMAGE_PARAM_STRIDE, ImageParam};
+use super::kernels::{CHUNK_TILES, FieldPipelines, N_TILE, Widths};
+use super::params::{Backdrop, Batch, IMAGE_PARAM_STRIDE, ImageParam};
 use crate::Error;
 use crate::gpu::{Buffer, Gpu, Passes, Pipeline};
 use crate::view::View;
@@ -32,13 +32,33 @@ pub(crate) struct Canvas {
     pub(crate) depths: Buffer,
     /// Parameters of the image whose appearance is used.
     pub(crate) image_params: Buffer,
-    /// Color and transmittance accumulated by the rays of a batch.
-    light: Buffer,
+    /// Color, transmittance, distance and front of the rays of a batch.
+    pub(crate) light: Buffer,
+    /// Distances at which every fourth ray along x and y meets something.
+    fronts: Buffer,
+    /// Per batch of rays: samples in its last round, and rounds that had samples.
+    pub(crate) progress: Buffer,
+    /// The grid's entries as f16.
+    packed_grid: Buffer,
+    /// Outputs of the first network.
+    geometry: Buffer,
+    /// Samples whose colors are evaluated: their number, spans, and weights in their rays.
+    pub(crate) selected: Buffer,
+    selected_spans: Buffer,
+    selected_weights: Buffer,
     pub(crate) n_pixels: u64,
 }
 
 impl Canvas {
-    pub(crate) fn new(gpu: &Gpu, n_pixels: u64, n_rays: u32) -> Result<Self, Error> {
+    pub(crate) fn new(
+        gpu: &Gpu,
+        widths: &Widths,
+        n_entries: u32,
+        n_pixels: u64,
+        n_rays: u32,
+        n_samples: u32,
+    ) -> Result<Self, Error> {
+        let per_sample = |name: &str, bytes: u32| gpu.storage(name, u64::from(bytes) * u64::from(n_samples));
         Ok(Self {
             view: gpu.uniform_with("nerf.view", &<View as bytemuck::Zeroable>::zeroed()),
             backdrop: gpu.uniform_with("nerf.backdrop", &<Backdrop as bytemuck::Zeroable>::zeroed()),
@@ -47,6 +67,13 @@ impl Canvas {
             image_params: gpu
                 .storage("nerf.picture_image_params", (IMAGE_PARAM_STRIDE * size_of::<ImageParam>()) as u64)?,
             light: gpu.storage("nerf.light", 32 * u64::from(n_rays))?,
+            fronts: gpu.storage("nerf.fronts", 4 * n_pixels)?,
+            progress: gpu.storage("nerf.progress", 8 * (2 * n_pixels.div_ceil(u64::from(n_rays)) + 1))?,
+            packed_grid: gpu.storage("nerf.packed_grid", 4 * u64::from(n_entries))?,
+            geometry: per_sample("nerf.geometry", 16 * widths.bytes_per_number())?,
+            selected: gpu.storage_with("nerf.selected", bytemuck::bytes_of(&Batch::of(0)))?,
+            selected_spans: per_sample("nerf.selected_spans", 16)?,
+            selected_weights: per_sample("nerf.selected_weights", 4)?,
             n_pixels,
         })
     }
@@ -54,6 +81,8 @@ impl Canvas {
 
 /// Layers of both networks.
 const N_LAYERS: u64 = 5;
+/// Maximum number of workgroups that evaluate the networks: enough for any GPU, and few if there are few samples.
+const MAX_NETWORK_GROUPS: u64 = 8192;
 /// Byte range of the number of samples in a batch.
 const N_SAMPLES_BYTES: Range<u64> = 4..8;
 
@@ -133,14 +162,11 @@ impl FieldPasses<'_> {
         list.clear(occupancy_sum);
         let (sum, n_word_groups) = (("occupancy_sum", occupancy_sum), groups(n_cells.pow(3) / 32, 64));
         list.dispatch(gpu, &pipelines.sum_cells, n_word_groups, &[cell_occupancy, sum]);
-        list.dispatch(gpu, &pipelines.mark_cells, n_word_groups, &[cell_occupancy, sum, ("occupied", occupied), steps]);
-        let n_words = n_blocks(*n_cells).pow(3).div_ceil(32);
-        list.dispatch(
-            gpu,
-            &pipelines.mark_blocks,
-            groups(n_words, 64),
-            &[("occupancy_update", occupancy_update), ("occupied", occupied)],
-        );
+        let occupancy_update = ("occupancy_update", occupancy_update);
+        let marked = [occupancy_update, cell_occupancy, sum, ("occupied", occupied), steps];
+        list.dispatch(gpu, &pipelines.mark_cells, n_word_groups, &marked);
+        let n_words = 2 * n_box_words(*n_cells);
+        list.dispatch(gpu, &pipelines.mark_blocks, groups(n_words, 64), &[occupancy_update, ("occupied", occupied)]);
     }
 
     /// Converts the current weights to the number type of the layers.
@@ -152,38 +178,100 @@ impl FieldPasses<'_> {
         }
     }
 
+    /// Converts weights and grid to the number types of pictures.
+    pub(crate) fn convert_for_picture(&self, list: &mut Passes, canvas: &Canvas) {
+        self.convert_weights(list);
+        let Self { gpu, pipelines, field, .. } = *self;
+        let n_groups = (canvas.packed_grid.bytes() / 8).div_ceil(256);
+        let packed = [("grid", &field.grid), ("packed_grid", &canvas.packed_grid)];
+        list.dispatch(gpu, &pipelines.pack_grid, n_groups, &packed);
+    }
+
     /// Density of every point, before the exponential. Run after [`FieldPasses::convert_weights`].
     fn densities(&self, list: &mut Passes) {
-        self.networks(list, &self.pipelines.densities, &self.field.unused_buffer);
+        let unused = &self.field.unused_buffer;
+        self.networks(
+            list,
+            &self.pipelines.densities,
+            [&self.samples.batch, &self.field.grid, &self.samples.spans, unused, unused],
+        );
     }
 
-    /// Density and color of every sample, before the exponential and the sigmoid. Run after
-    /// [`FieldPasses::convert_weights`].
-    pub(crate) fn colors(&self, list: &mut Passes) {
-        self.networks(list, &self.pipelines.colors, &self.field.unused_buffer);
-    }
-
-    /// Like [`FieldPasses::colors`], and stores everything needed for the backward pass.
+    /// Density and color of every sample, before the exponential and the sigmoid, and everything needed for the
+    /// backward pass. Run after [`FieldPasses::convert_weights`].
     pub(crate) fn forward(&self, list: &mut Passes, step: &StepBuffers) {
-        self.networks(list, &self.pipelines.forward, &step.activations);
+        let SampleBuffers { batch, spans, .. } = self.samples;
+        self.networks(
+            list,
+            &self.pipelines.forward,
+            [batch, &self.field.grid, spans, &step.activations, &self.field.unused_buffer],
+        );
     }
 
-    fn networks(&self, list: &mut Passes, pipeline: &Pipeline, activations: &Buffer) {
+    /// Densities of a picture's samples, and the selection of those whose colors contribute to their rays. Run after
+    /// [`FieldPasses::find`].
+    pub(crate) fn select(&self, list: &mut Passes, canvas: &Canvas) {
+        let Self { gpu, pipelines, field, samples, slot, .. } = *self;
+        let Canvas { light, packed_grid, geometry, selected, selected_spans, selected_weights, .. } = canvas;
+        let unused = &field.unused_buffer;
+        self.networks(
+            list,
+            &pipelines.picture_densities,
+            [&samples.batch, packed_grid, &samples.spans, unused, geometry],
+        );
+        list.clear_range(selected, N_SAMPLES_BYTES);
+        let composited = [
+            ("march", &slot.march),
+            ("spans", &samples.spans),
+            ("log_density", &samples.log_density),
+            ("rays", &slot.rays),
+            ("light", light),
+            ("selected", selected),
+            ("selected_spans", selected_spans),
+            ("selected_weights", selected_weights),
+            ("batch", &samples.batch),
+        ];
+        list.dispatch(gpu, &pipelines.select_samples, groups(slot.n_rays, 256), &composited);
+    }
+
+    /// Colors of the selected samples. Run after [`FieldPasses::select`].
+    pub(crate) fn picture_colors(&self, list: &mut Passes, canvas: &Canvas) {
+        let Self { pipelines, field, .. } = *self;
+        let Canvas { packed_grid, geometry, selected, selected_spans, .. } = canvas;
+        let unused = &field.unused_buffer;
+        self.networks(list, &pipelines.picture_colors, [selected, packed_grid, selected_spans, unused, geometry]);
+    }
+
+    /// Like [`FieldPasses::picture_colors`], but with the colors of all samples.
+    pub(crate) fn all_picture_colors(&self, list: &mut Passes, canvas: &Canvas) {
+        let SampleBuffers { batch, spans, .. } = self.samples;
+        let buffers = [batch, &canvas.packed_grid, spans, &self.field.unused_buffer, &canvas.geometry];
+        self.networks(list, &self.pipelines.picture_densities, buffers);
+        self.networks(list, &self.pipelines.picture_colors, buffers);
+    }
+
+    fn networks(
+        &self,
+        list: &mut Passes,
+        pipeline: &Pipeline,
+        [batch, grid, spans, activations, geometry]: [&Buffer; 5],
+    ) {
         let Self { gpu, field, samples, slot, image_params, .. } = *self;
         let buffers = [
-            ("batch", &samples.batch),
+            ("batch", batch),
             ("levels", &field.levels),
             ("points", &samples.points),
-            ("grid", &field.grid),
+            ("grid", grid),
             ("weights", field.working_weights()),
             ("rays", &slot.rays),
-            ("spans", &samples.spans),
+            ("spans", spans),
             ("image_params", image_params),
             ("log_density", &samples.log_density),
             ("colors", &samples.colors),
             ("activations", activations),
+            ("geometry", geometry),
         ];
-        list.dispatch(gpu, pipeline, groups(samples.n_samples, N_TILE), &buffers);
+        list.dispatch(gpu, pipeline, groups(samples.n_samples, N_TILE).min(MAX_NETWORK_GROUPS), &buffers);
     }
 
     /// Finds the next samples of a picture's rays.
@@ -201,6 +289,20 @@ impl FieldPasses<'_> {
         list.dispatch(gpu, &pipelines.find_samples, groups(slot.n_rays, 256), &found);
     }
 
+    /// Keeps the distances at which the rays meet something.
+    pub(crate) fn keep_fronts(&self, list: &mut Passes, canvas: &Canvas) {
+        let Self { gpu, pipelines, samples, slot, .. } = *self;
+        let kept = [
+            ("batch", &samples.batch),
+            ("march", &slot.march),
+            ("view", &canvas.view),
+            ("rays", &slot.rays),
+            ("light", &canvas.light),
+            ("fronts", &canvas.fronts),
+        ];
+        list.dispatch(gpu, &pipelines.keep_fronts, groups(slot.n_rays, 64), &kept);
+    }
+
     /// Generates the rays of a picture's pixels.
     pub(crate) fn picture_rays(&self, list: &mut Passes, canvas: &Canvas) {
         let Self { gpu, pipelines, samples, slot, .. } = *self;
@@ -210,11 +312,13 @@ impl FieldPasses<'_> {
             ("view", &canvas.view),
             ("rays", &slot.rays),
             ("light", &canvas.light),
+            ("fronts", &canvas.fronts),
         ];
         list.dispatch(gpu, &pipelines.picture_rays, groups(slot.n_rays, 64), &posed);
     }
 
-    /// Writes the pixels of the rays. Run after [`FieldPasses::colors`].
+    /// Writes the pixels of the rays. Run after
+    /// [`FieldPasses::picture_colors`].
     pub(crate) fn show(&self, list: &mut Passes, canvas: &Canvas) {
         let Self { gpu, pipelines, samples, slot, .. } = *self;
         let shown = [
@@ -223,8 +327,7 @@ impl FieldPasses<'_> {
             ("view", &canvas.view),
             ("backdrop", &canvas.backdrop),
             ("rays", &slot.rays),
-            ("spans", &samples.spans),
-            ("log_density", &samples.log_density),
+            ("selected_weights", &canvas.selected_weights),
             ("colors", &samples.colors),
             ("pixels", &canvas.pixels),
             ("depths", &canvas.depths),

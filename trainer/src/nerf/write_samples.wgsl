@@ -33,16 +33,21 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     let path = path_of(march, ray);
     let range = segments_of_thread(path, ix % THREADS_PER_RAY);
     var n = n_before[ix];
-    var segment = next_segment(march, ray, path, range.x, range.y);
-    while segment.ix < range.y {
-        let at = n / thinning.stride;
-        if n % thinning.stride == thinning.phase && at < ray.n_samples {
-            let middle = 0.5 * (segment.begin + segment.end);
-            let reach = 0.5 * (segment.end - segment.begin) * f32(thinning.stride);
-            spans[ray.first_sample + at] = Span(middle - reach, middle + reach, ray_ix, 0u);
-            points[ray.first_sample + at] = vec4f(contract(ray.origin + middle * ray.direction), 0.0);
+    let boxes = boxes_of(march.n_cells);
+    var segment_ix = range.x;
+    while segment_ix < range.y {
+        let visit = visit(march, boxes, ray, path, segment_ix, range.y, 0u);
+        if visit.is_marked {
+            let at = n / thinning.stride;
+            if n % thinning.stride == thinning.phase && at < ray.n_samples {
+                let segment = segment_of(march, ray, path, segment_ix);
+                let middle = 0.5 * (segment.x + segment.y);
+                let reach = 0.5 * (segment.y - segment.x) * f32(thinning.stride);
+                spans[ray.first_sample + at] = Span(middle - reach, middle + reach, ray_ix, ray.first_sample + at);
+                points[ray.first_sample + at] = vec4f(contract(ray.origin + middle * ray.direction), 0.0);
+            }
+            n++;
         }
-        n++;
-        segment = next_segment(march, ray, path, segment.ix + 1u, range.y);
+        segment_ix = visit.next_ix;
     }
 }

@@ -1,11 +1,13 @@
 //! Packs pictures on the GPU for viewers: color as JPEG, depth as 16-bit counts at half resolution. This reduces the
 //! read-back to about a fifth, and the CPU no longer encodes.
 
+mod panorama;
 mod tables;
 
-use crate::gpu::{Buffer, Gpu, Kernel, Passes, PendingRead, Pipeline, Source};
-use crate::view::{Camera, projections};
+use crate::gpu::{Buffer, Gpu, Passes, PendingRead, Pipeline, Source};
+use crate::view::Camera;
 use crate::{Error, Picture, Projection, RenderRequest};
+use panorama::{Face, Panorama};
 
 /// MCUs (8 x 8 pixels, no subsampling) per restart interval, which one lane encodes.
 const MCUS_PER_INTERVAL: u32 = 2;
@@ -19,11 +21,41 @@ const HEADER_WORDS: u32 = 4;
 /// JPEG quality of complete pictures for viewers. It gives no visible blocks on textures.
 pub const JPEG_QUALITY: u8 = 92;
 
-/// How a drawn picture is read back.
+/// Format in which a picture is read back.
 #[derive(Clone, Copy, Debug)]
-pub(crate) enum Output {
+pub(crate) enum Format {
     Picture { depth: bool },
     Packed(Packing),
+}
+
+/// What happens to a drawn pinhole view.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Output {
+    pub(crate) format: Format,
+    /// If it is a face of a panorama. Only the last face reads the panorama back.
+    face: Option<Face>,
+}
+
+impl Output {
+    /// A pinhole picture with or without depth.
+    pub(crate) fn picture(depth: bool) -> Self {
+        Self { format: Format::Picture { depth }, face: None }
+    }
+
+    /// A packed pinhole picture.
+    pub(crate) fn packed(packing: Packing) -> Self {
+        Self { format: Format::Packed(packing), face: None }
+    }
+
+    /// Size of the picture, if the view has `view_px`.
+    pub(crate) fn size_px(&self, view_px: [u32; 2]) -> [u32; 2] {
+        self.face.map_or(view_px, |face| face.panorama_px)
+    }
+
+    /// Whether the picture is complete after this view.
+    pub(crate) fn is_complete(&self) -> bool {
+        self.face.is_none_or(Face::is_last)
+    }
 }
 
 /// What to pack.
@@ -129,25 +161,33 @@ impl QueuedPicture {
 }
 
 impl Rendered {
-    /// Renders a request with `draw`, which draws and reads back a pinhole view. Other projections are not packed.
+    /// Renders a request with `draw`, which draws a pinhole view and returns the picture if it is complete.
     pub(crate) fn of(
         request: &RenderRequest,
-        packing: Packing,
-        mut draw: impl FnMut(&Camera, Output) -> Result<Self, Error>,
+        format: Format,
+        mut draw: impl FnMut(&Camera, Output) -> Result<Option<Self>, Error>,
     ) -> Result<Self, Error> {
-        if let Projection::Pinhole { focal_px, principal_px } = request.projection {
-            return draw(&Camera::from_request(request, focal_px, principal_px), Output::Packed(packing));
+        let mut rendered = None;
+        match request.projection {
+            Projection::Pinhole { focal_px, principal_px } => {
+                let camera = Camera::from_request(request, focal_px, principal_px);
+                rendered = draw(&camera, Output { format, face: None })?;
+            }
+            Projection::Equirectangular => {
+                for face in Face::all(request.size_px) {
+                    rendered = draw(&face.camera(request), Output { format, face: Some(face) })?;
+                }
+            }
         }
-        Self::picture(request, draw).map(Self::Picture)
+        rendered.ok_or(Error::DeviceLost)
     }
 
-    /// Renders a request without packing it. `draw` draws and reads back a pinhole view.
+    /// Like [`Self::of`], but never packed.
     pub(crate) fn picture(
         request: &RenderRequest,
-        mut draw: impl FnMut(&Camera, Output) -> Result<Self, Error>,
+        draw: impl FnMut(&Camera, Output) -> Result<Option<Self>, Error>,
     ) -> Result<Picture, Error> {
-        let output = Output::Picture { depth: request.depth };
-        projections::render(request, |camera| draw(camera, output)?.into_picture())
+        Self::of(request, Format::Picture { depth: request.depth }, draw)?.into_picture()
     }
 
     /// The pixels and depths, if the picture is not packed.
@@ -159,9 +199,10 @@ impl Rendered {
     }
 
     /// A picture that shows only the background.
-    pub(crate) fn empty(size_px: [u32; 2], background_srgb: [f32; 3], output: Output) -> Self {
-        let (Output::Picture { depth } | Output::Packed(Packing { depth, .. })) = output;
-        Self::Picture(Picture::empty(size_px, background_srgb, depth))
+    pub(crate) fn empty(view_px: [u32; 2], background_srgb: [f32; 3], output: Output) -> Option<Self> {
+        let (Format::Picture { depth } | Format::Packed(Packing { depth, .. })) = output.format;
+        let size_px = output.size_px(view_px);
+        output.is_complete().then(|| Self::Picture(Picture::empty(size_px, background_srgb, depth)))
     }
 
     /// Width and height, pixels.
@@ -220,9 +261,13 @@ const SHARED: &[Source] = &[
 
 macro_rules! kernel {
     ($name:literal) => {
-        Kernel { source: Source { name: $name, text: include_str!(concat!($name, ".wgsl")) }, shared: SHARED }
+        crate::gpu::Kernel {
+            source: crate::gpu::Source { name: $name, text: include_str!(concat!($name, ".wgsl")) },
+            shared: crate::packing::SHARED,
+        }
     };
 }
+use kernel;
 
 /// Kernels and buffers that pack pictures.
 #[derive(Debug)]
@@ -351,17 +396,19 @@ impl Packer {
     }
 }
 
-/// A packer, compiled when a packed picture is requested for the first time.
+/// Reads pictures back. What this needs is created when a picture needs it.
 #[derive(Debug, Default)]
-pub(crate) struct LazyPacker(Option<Packer>);
+pub(crate) struct Reader {
+    packer: Option<Packer>,
+    panorama: Option<Panorama>,
+}
 
-impl LazyPacker {
-    /// The packer.
-    pub(crate) fn get(&mut self, gpu: &Gpu) -> Result<&mut Packer, Error> {
-        if self.0.is_none() {
-            self.0 = Some(Packer::new(gpu)?);
+impl Reader {
+    fn packer(&mut self, gpu: &Gpu) -> Result<&mut Packer, Error> {
+        if self.packer.is_none() {
+            self.packer = Some(Packer::new(gpu)?);
         }
-        self.0.as_mut().ok_or(Error::DeviceLost)
+        self.packer.as_mut().ok_or(Error::DeviceLost)
     }
 
     /// The same output, or an unpacked picture if the adapter is a CPU or GPU memory is too small for packing.
@@ -370,52 +417,91 @@ impl LazyPacker {
         gpu: &Gpu,
         passes: &mut Passes,
         output: Output,
-        size_px: [u32; 2],
+        view_px: [u32; 2],
     ) -> Result<Output, Error> {
-        let Output::Packed(Packing { depth, .. }) = output else { return Ok(output) };
+        let Format::Packed(Packing { depth, .. }) = output.format else { return Ok(output) };
+        let unpacked = Output { format: Format::Picture { depth }, ..output };
         if gpu.is_software() {
-            return Ok(Output::Picture { depth }); // Kernels would take longer than the encoders of the server.
+            return Ok(unpacked); // Kernels would take longer than the encoders of the server.
         }
-        match self.get(gpu)?.reserve(gpu, passes, Sizes::of(size_px)) {
-            Err(error) if error.is_out_of_memory() => Ok(Output::Picture { depth }),
+        match self.packer(gpu)?.reserve(gpu, passes, Sizes::of(output.size_px(view_px))) {
+            Err(error) if error.is_out_of_memory() => Ok(unpacked),
             reserved => reserved.map(|()| output),
         }
     }
 
-    /// Submits the passes that draw a picture into `pixels` (rgba8) and `depths` (meters), and reads it back.
+    /// Records the passes after those that draw a view into `canvas`: pixels (rgba8) and depths (meters). Returns the
+    /// buffers to read back for [`Self::take`], none if the picture is not complete.
+    pub(crate) fn record<'a>(
+        &'a mut self,
+        gpu: &Gpu,
+        passes: &mut Passes,
+        output: Output,
+        view_px: [u32; 2],
+        canvas: [&'a Buffer; 2],
+    ) -> Result<Vec<(&'a Buffer, usize)>, Error> {
+        let Self { packer, panorama } = self;
+        let canvas = match output.face {
+            Some(face) => Panorama::record(panorama, gpu, passes, face, canvas)?,
+            None => canvas,
+        };
+        let size_px = output.size_px(view_px);
+        match output.format {
+            _ if !output.is_complete() => Ok(Vec::new()),
+            Format::Picture { depth } => Ok(Picture::buffers(size_px, canvas[0], depth.then_some(canvas[1]))),
+            Format::Packed(packing) => {
+                packer.as_mut().ok_or(Error::DeviceLost)?.record(gpu, passes, packing, size_px, canvas)
+            }
+        }
+    }
+
+    /// The picture from the data read back after [`Self::record`]; `None` if it could not be packed.
+    pub(crate) fn take(output: Output, view_px: [u32; 2], parts: &[&[u8]]) -> Option<Rendered> {
+        let size_px = output.size_px(view_px);
+        match output.format {
+            Format::Picture { .. } => Some(Rendered::Picture(Picture::from_parts(size_px, parts))),
+            Format::Packed(packing) => unpack(packing, size_px, parts).map(Rendered::Packed),
+        }
+    }
+
+    /// Reads a picture that could not be packed, whose last view was drawn into `canvas`.
+    pub(crate) fn read_unpacked(
+        &self,
+        gpu: &Gpu,
+        passes: &mut Passes,
+        output: Output,
+        view_px: [u32; 2],
+        canvas: [&Buffer; 2],
+    ) -> Result<Rendered, Error> {
+        let (Format::Picture { depth } | Format::Packed(Packing { depth, .. })) = output.format;
+        let [pixels, depths] = match (output.face, &self.panorama) {
+            (Some(_), Some(panorama)) => panorama.canvas(),
+            _ => canvas,
+        };
+        let size_px = output.size_px(view_px);
+        let read = passes.submit_reading(gpu, &Picture::buffers(size_px, pixels, depth.then_some(depths)));
+        read.finish_with(gpu, |parts| Rendered::Picture(Picture::from_parts(size_px, parts)))
+    }
+
+    /// Submits the passes that draw a view into `canvas`, and reads the picture back if it is complete.
     pub(crate) fn read(
         &mut self,
         gpu: &Gpu,
         passes: &mut Passes,
         output: Output,
-        size_px: [u32; 2],
+        view_px: [u32; 2],
         canvas: [&Buffer; 2],
-    ) -> Result<Rendered, Error> {
-        let has_depth = match self.available(gpu, passes, output, size_px)? {
-            Output::Picture { depth } => depth,
-            Output::Packed(packing) => {
-                let reads = self.get(gpu)?.record(gpu, passes, packing, size_px, canvas)?;
-                let read = passes.submit_reading(gpu, &reads);
-                if let Some(packed) = read.finish_with(gpu, |parts| unpack(packing, size_px, parts))? {
-                    return Ok(Rendered::Packed(packed));
-                }
-                packing.depth
-            }
-        };
-        read_picture(gpu, passes, size_px, canvas, has_depth).map(Rendered::Picture)
+    ) -> Result<Option<Rendered>, Error> {
+        let output = self.available(gpu, passes, output, view_px)?;
+        let reads = self.record(gpu, passes, output, view_px, canvas)?;
+        if reads.is_empty() {
+            passes.submit(gpu);
+            return Ok(None);
+        }
+        let read = passes.submit_reading(gpu, &reads);
+        let taken = read.finish_with(gpu, |parts| Self::take(output, view_px, parts))?;
+        taken.map_or_else(|| self.read_unpacked(gpu, passes, output, view_px, canvas), Ok).map(Some)
     }
-}
-
-/// Submits the passes and reads the picture back without packing it.
-pub(crate) fn read_picture(
-    gpu: &Gpu,
-    passes: &mut Passes,
-    size_px: [u32; 2],
-    [pixels, depths]: [&Buffer; 2],
-    has_depth: bool,
-) -> Result<Picture, Error> {
-    let read = passes.submit_reading(gpu, &Picture::buffers(size_px, pixels, has_depth.then_some(depths)));
-    read.finish_with(gpu, |parts| Picture::from_parts(size_px, parts))
 }
 
 /// Assembles the data read back from [`Packer::record`]. `None` if the JPEG file was too long.
@@ -450,8 +536,8 @@ pub(crate) fn unpack(packing: Packing, size_px: [u32; 2], parts: &[&[u8]]) -> Op
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::gpu::GpuOptions;
     use crate::gpu::testing::{assert_layout, assert_valid};
+    use crate::gpu::{GpuOptions, Kernel};
 
     const KERNELS: &[Kernel] = &[
         kernel!("jpeg_transform"),
@@ -460,6 +546,7 @@ mod tests {
         kernel!("jpeg_join"),
         kernel!("depth_halve"),
         kernel!("depth_counts"),
+        kernel!("panorama_face"),
     ];
 
     #[test]

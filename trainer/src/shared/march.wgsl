@@ -48,47 +48,99 @@ fn distance_at(march: March, path: Path, steps: f32) -> f32 {
     return path.leave + distance_of((inside - path.n_inside) * march.step);
 }
 
-fn bit_of(first_word: u32, n: u32, cell: vec3u) -> bool {
-    let ix = cell.x + n * (cell.y + n * cell.z);
+// Number of the segment at a distance along the ray.
+fn segment_at(march: March, path: Path, distance: f32) -> u32 {
+    var steps = path.n_before - share_of(max(path.enter - distance, 0.0)) / march.step;
+    if distance > path.enter { steps = path.n_before + min((distance - path.enter) / march.step, path.n_inside); }
+    if distance > path.leave { steps = path.n_before + path.n_inside + share_of(distance - path.leave) / march.step; }
+    return u32(clamp(steps, 0.0, 1e6));
+}
+
+// Middle of a segment along the ray.
+fn middle_of(march: March, ray: Ray, path: Path, ix: u32) -> vec3f {
+    let steps = f32(ix) + ray.jitter;
+    let inside = steps - path.n_before;
+    var distance: f32;
+    if inside >= 0.0 && inside + 1.0 <= path.n_inside {
+        distance = path.enter + (inside + 0.5) * march.step;
+    } else {
+        distance = 0.5 * (distance_at(march, path, steps) + distance_at(march, path, steps + 1.0));
+    }
+    return ray.origin + distance * ray.direction;
+}
+
+// Begin and end of a segment along the ray.
+fn segment_of(march: March, ray: Ray, path: Path, ix: u32) -> vec2f {
+    let steps = f32(ix) + ray.jitter;
+    return vec2f(distance_at(march, path, steps), distance_at(march, path, steps + 1.0));
+}
+
+fn bit_of(first_word: u32, box: vec3u, log2_n: u32) -> bool {
+    let ix = box.x + (box.y << log2_n) + (box.z << (2u * log2_n));
     return (occupied[first_word + ix / 32u] >> (ix % 32u) & 1u) == 1u;
 }
 
-// Number of steps from `at` whose midpoints all lie in the same empty box of the unit cube; the first midpoint is in
-// it. Returns one if the box extends beyond the inner cube. Only inside the inner cube do unit cube and world differ by
-// a constant factor, so that all steps are equal.
-fn n_empty_steps(march: March, at: vec3f, direction: vec3f, box: vec3u, n_boxes: u32) -> u32 {
-    let size = 4.0 / f32(n_boxes);
-    let low = vec3f(box) * size - 2.0;
-    let high = low + size;
-    if any(abs(at) > vec3f(1.0)) || any(low < vec3f(-1.0)) || any(high > vec3f(1.0)) { return 1u; }
-    let out = (select(low, high, direction > vec3f(0.0)) - at) / direction;
-    let ends = select(out, vec3f(FAR), abs(direction) < vec3f(1e-6));
-    return u32(clamp(min(ends.x, min(ends.y, ends.z)) / march.step - 0.5, 1.0, 4096.0));
+// Whether the line between two points outside the inner cube contracts to a curve in the box [low, high] of the
+// contracted space [-2, 2]^3; the first point is in it.
+//
+// If the same coordinate m is largest at both points, it is largest between them, and any coordinate is p = a m + b. With
+// u = 1 / m, it contracts to (2 - u) (a + b u), which has one extremum, at u = 1 - a / (2 b).
+fn stays_in_box(first: vec3f, last: vec3f, low: vec3f, high: vec3f) -> bool {
+    let size = abs(first);
+    let m = max(size.x, max(size.y, size.z));
+    let axis = select(vec3f(0.0), sign(first), size == vec3f(m));
+    let last_m = dot(last, axis) / dot(axis, axis);
+    let last_size = abs(last);
+    if m <= 1.0 || last_m <= 1.0 || last_m < max(last_size.x, max(last_size.y, last_size.z)) { return false; }
+    let end = last * (2.0 - 1.0 / last_m) / last_m;
+    if any(end < low) || any(end > high) { return false; }
+    if last_m == m { return true; }
+    let a = (last - first) / (last_m - m);
+    let b = first - a * m;
+    let u = 1.0 - 0.5 * a / b;
+    let extremum = (2.0 - u) * (a + b * u);
+    let is_between = (u > vec3f(min(1.0 / m, 1.0 / last_m))) & (u < vec3f(max(1.0 / m, 1.0 / last_m)));
+    return !any(is_between & ((extremum < low) | (extremum > high)));
 }
 
-// A segment of a ray in an occupied cell. If there is none before `end_ix`, `ix` is `end_ix`.
-struct RaySegment {
-    ix: u32,
-    begin: f32,
-    end: f32,
+struct Visit {
+    is_marked: bool,       // whether the segment is in a marked cell
+    next_ix: u32,          // first segment that may be marked after this one
 }
 
-// The first such segment, starting the search at number `from_ix`.
-fn next_segment(march: March, ray: Ray, path: Path, from_ix: u32, end_ix: u32) -> RaySegment {
-    let block_cells = block_cells_of(march.n_cells);
-    let n_blocks = march.n_cells / block_cells;
-    let n_words = march.n_cells * march.n_cells * march.n_cells / 32u;
-    var ix = from_ix;
-    while ix < end_ix {
-        let begin = distance_at(march, path, f32(ix) + ray.jitter);
-        let end = distance_at(march, path, f32(ix + 1u) + ray.jitter);
-        let middle = contract(ray.origin + 0.5 * (begin + end) * ray.direction);
-        let cell = min(vec3u(middle * f32(march.n_cells)), vec3u(march.n_cells - 1u));
-        let block = cell / block_cells;
-        let block_is_empty = !bit_of(n_words, n_blocks, block);
-        if !block_is_empty && bit_of(0u, march.n_cells, cell) { return RaySegment(ix, begin, end); }
-        let at = ray.origin + begin * ray.direction;
-        ix += n_empty_steps(march, at, ray.direction, select(cell, block, block_is_empty), select(march.n_cells, n_blocks, block_is_empty));
+// Looks up the cell of a segment. Segments before `free_ix` count only if they are in solid cells.
+fn visit(march: March, boxes: Boxes, ray: Ray, path: Path, ix: u32, end_ix: u32, free_ix: u32) -> Visit {
+    let middle = middle_of(march, ray, path, ix);
+    let is_inside = all(abs(middle) <= vec3f(1.0));
+    var at = (middle + 2.0) / 4.0;
+    if !is_inside { at = contract(middle); }
+    let cell = min(vec3u(at * f32(march.n_cells)), vec3u(march.n_cells - 1u));
+    let first_word = select(0u, boxes.set_words, ix < free_ix);
+    // The largest empty box around the segment.
+    var log2_side = boxes.log2_block;
+    if bit_of(first_word + boxes.block_word, cell >> vec3u(log2_side), boxes.log2_cells - log2_side) {
+        log2_side = boxes.log2_group;
+        if bit_of(first_word + boxes.group_word, cell >> vec3u(log2_side), boxes.log2_cells - log2_side) {
+            log2_side = 0u;
+            if bit_of(first_word, cell, boxes.log2_cells) { return Visit(true, ix + 1u); }
+        }
     }
-    return RaySegment(end_ix, 0.0, 0.0);
+    let size = 4.0 * f32(1u << log2_side) / f32(march.n_cells);
+    let low = vec3f(cell >> vec3u(log2_side)) * size - 2.0;
+    let high = low + size;
+    var n = 1u;
+    if is_inside && all(low >= vec3f(-1.0)) && all(high <= vec3f(1.0)) {
+        // Inside the inner cube, unit cube and world differ by a constant factor, so all steps are equal.
+        let out = (select(low, high, ray.direction > vec3f(0.0)) - middle) / ray.direction;
+        let ends = select(out, vec3f(FAR), abs(ray.direction) < vec3f(1e-6));
+        n = u32(clamp(min(ends.x, min(ends.y, ends.z)) / march.step + 0.5, 1.0, 4096.0)); // rounded down, with a margin
+    } else {
+        for (var more = select(0u, select(4u, 16u, log2_side == boxes.log2_block), log2_side > 0u); more > 1u; more /= 4u) {
+            if ix + more < end_ix && stays_in_box(middle, middle_of(march, ray, path, ix + more), low, high) {
+                n = more + 1u;
+                break;
+            }
+        }
+    }
+    return Visit(false, select(ix + n, min(ix + n, free_ix), ix < free_ix));
 }

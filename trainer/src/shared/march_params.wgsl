@@ -6,8 +6,8 @@ struct March {
     n_cells: u32,          // cells of the occupancy grid along an axis
     first_ray: u32,        // index of this batch's first ray within a picture
     max_found: u32,       // maximum number of segments to find per ray
-    unused: u32,
-    unused_2: vec2u,
+    pixel_stride: u32,     // of a picture: 4 to find the distances at which its surfaces begin, then 1
+    unused: vec2u,
 }
 
 // Selects every `stride`-th found segment, starting at `phase`. Each selected segment represents `stride` segments.

@@ -18,7 +18,7 @@ struct Ray {
     target_rgb: u32,        // rgba8; a = 0: no observation
     target_distance: f32,   // along the ray; 0: unknown
     jitter: f32,             // offset of the samples, in steps, 0 to 1
-    is_finished: u32,          // for a ray of a picture: 1 if it reached full opacity or its end
+    progress: u32,          // of a ray of a picture
     next_segment: u32,        // for a ray of a picture: first segment not searched yet
 }
 
@@ -27,5 +27,12 @@ struct Span {
     begin: f32,
     end: f32,
     ray: u32,
-    unused: u32,
+    sample: u32,           // index of the sample, of which another list may hold a selection
 }
+
+// Progress of a ray of a picture. It has ended when it is opaque or past the scene.
+const RAY_RUNNING = 0u;
+const RAY_ENDED = 1u;
+const RAY_SHOWN = 2u;
+// Distance at which a ray of a picture meets something, if it meets nothing.
+const FAR_FRONT = 1e9;

@@ -5,10 +5,12 @@
 
 const BANK = 576u;                 // start of the second bank: 64 strides
 
+var<private> n_workgroups: u32;
 var<workgroup> wg_rows: array<vec4f, 1152>;
 
 @compute @workgroup_size(LANES)
 fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
+    n_workgroups = n_wgs.x * n_wgs.y;
     work(folded(wg, n_wgs), lane);
 }
 

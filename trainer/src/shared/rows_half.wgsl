@@ -8,6 +8,7 @@ const HALF_STRIDE = 10u;           // like STRIDE, in vec4 of f16
 
 var<workgroup> wg_halves: array<vec4<f16>, 640>;
 var<workgroup> wg_sums: array<vec4f, 576>;
+var<private> n_workgroups: u32;
 var<private> subgroup: u32;
 var<private> n_subgroups: u32;
 
@@ -18,6 +19,7 @@ fn main(
 ) {
     subgroup = subgroup_ix;
     n_subgroups = n_subgroups_total;
+    n_workgroups = n_wgs.x * n_wgs.y;
     work(folded(wg, n_wgs), lane);
 }
 

@@ -13,7 +13,7 @@ use super::params::{Camera, LOW_PASS_PX2, Rule, Supervision, status};
 use super::passes::{Target, ViewPasses};
 use super::work_counts::WorkCounts;
 use crate::gpu::{Buffer, Gpu, PassTiming, Passes, f32_of};
-use crate::packing::{JPEG_QUALITY, LazyPacker};
+use crate::packing::{JPEG_QUALITY, Output, Reader};
 use crate::{Error, Packing};
 use kinematics::Transform;
 use kinematics::quantile::{Rank, quantile};
@@ -130,7 +130,7 @@ struct KernelBench {
     gains: Buffer,
     rule: Buffer,
     rule_visible: Buffer,
-    packer: RefCell<LazyPacker>,
+    reader: RefCell<Reader>,
     size_px: [u32; 2],
     losses: Losses,
 }
@@ -220,7 +220,7 @@ impl KernelBench {
             gains: gpu.storage_with("bench.gains", bytemuck::cast_slice(&[1.0f32; 4]))?,
             rule: gpu.uniform_with("bench.rule", &rule()),
             rule_visible: gpu.uniform_with("bench.rule_touched", &Rule { update_all: 0, ..rule() }),
-            packer: RefCell::default(),
+            reader: RefCell::default(),
             draw,
             train,
             splats,
@@ -280,8 +280,9 @@ impl KernelBench {
         self.view_passes().finish(passes, &self.draw, &self.supervision);
         let ImageBuffers { pixels, depths, .. } = &self.image_buffers;
         let packing = Packing { jpeg_quality: Some(JPEG_QUALITY), depth: true };
-        let mut packer = self.packer.borrow_mut();
-        packer.get(&self.gpu)?.record(&self.gpu, passes, packing, self.size_px, [pixels, depths]).map(drop)
+        let mut reader = self.reader.borrow_mut();
+        let output = reader.available(&self.gpu, passes, Output::packed(packing), self.size_px)?;
+        reader.record(&self.gpu, passes, output, self.size_px, [pixels, depths]).map(drop)
     }
 
     fn record_step(&self, passes: &mut Passes) -> Result<(), Error> {

@@ -37,7 +37,7 @@ use crate::checkpoint::PendingCheckpoint;
 use crate::gpu::{Gpu, PassTiming};
 use crate::model_metadata::{METADATA_FILE, read_metadata};
 use crate::model_options::{MethodOptions, ModelOptions};
-use crate::packing::Output;
+use crate::packing::{Format, Output};
 use crate::{Bounds, Error, Method, Packing, Picture, Progress, Projection, QueuedPicture, RenderRequest, Rendered};
 use calibration::{Alignment, CalibratedCamera, CameraCorrection, Trial, TrialReport};
 use keyframe::{Keyframe, Split};
@@ -193,7 +193,12 @@ impl SplatTrainer {
     }
 
     /// Draws one pinhole view of the displayed splats.
-    fn draw_view(&mut self, camera: &Camera, background_srgb: [f32; 3], output: Output) -> Result<Rendered, Error> {
+    fn draw_view(
+        &mut self,
+        camera: &Camera,
+        background_srgb: [f32; 3],
+        output: Output,
+    ) -> Result<Option<Rendered>, Error> {
         let splats = displayed(&self.growth_search, &self.trials, &self.model);
         self.renderer.picture(&mut self.recorder, DrawnView { splats, camera, background_srgb }, output)
     }
@@ -291,7 +296,9 @@ impl Method for SplatTrainer {
 
     fn render_packed(&mut self, request: &RenderRequest, packing: Packing) -> Result<Rendered, Error> {
         self.seed_from_depth()?;
-        Rendered::of(request, packing, |camera, output| self.draw_view(camera, request.background_srgb, output))
+        Rendered::of(request, Format::Packed(packing), |camera, output| {
+            self.draw_view(camera, request.background_srgb, output)
+        })
     }
 
     fn queue_packed(&mut self, request: &RenderRequest, packing: Packing) -> Result<QueuedPicture, Error> {

@@ -22,7 +22,7 @@ use crate::Bounds;
 use crate::checkpoint::PendingCheckpoint;
 use crate::gpu::{Gpu, PassTiming, Passes};
 use crate::model_options::ModelOptions;
-use crate::packing::LazyPacker;
+use crate::packing::{Format, Reader};
 use crate::{CorrectedKeyframe, Error, Method, Packing, Picture, Progress, Recalibrate, RenderRequest, Rendered};
 use calibration::Alignment;
 use calibration::CalibratedCamera;
@@ -59,7 +59,7 @@ pub struct TsdfModel {
     store: Option<FieldStore>,
     fusion: Fusion,
     canvas: Option<Canvas>,
-    packer: LazyPacker,
+    reader: Reader,
     meshing: Meshing,
 }
 
@@ -83,7 +83,7 @@ impl TsdfModel {
             store: None,
             fusion: Fusion::new(),
             canvas: None,
-            packer: LazyPacker::default(),
+            reader: Reader::default(),
             meshing: Meshing::default(),
             gpu,
             options,
@@ -343,7 +343,9 @@ impl Method for TsdfModel {
     fn render_packed(&mut self, request: &RenderRequest, packing: Packing) -> Result<Rendered, Error> {
         self.finish_in_flight()?;
         self.fuse_one()?;
-        Rendered::of(request, packing, |camera, output| self.draw_view(camera, request.background_srgb, output))
+        Rendered::of(request, Format::Packed(packing), |camera, output| {
+            self.draw_view(camera, request.background_srgb, output)
+        })
     }
 
     fn set_watched(&mut self, watched: bool) {

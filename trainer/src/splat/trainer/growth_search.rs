@@ -259,9 +259,8 @@ impl SplatTrainer {
                 let depth_rmse_m = match measured_m.is_empty() {
                     true => None,
                     false => {
-                        let picture =
-                            self.renderer.picture(&mut self.recorder, drawn, Output::Picture { depth: true })?;
-                        let picture = picture.into_picture()?;
+                        let picture = self.renderer.picture(&mut self.recorder, drawn, Output::picture(true))?;
+                        let picture = picture.ok_or(Error::DeviceLost)?.into_picture()?;
                         depth_rmse_m(&picture.depth_m, &measured_m)?
                     }
                 };

@@ -3,12 +3,12 @@
 use super::products::{self, Products};
 use super::recorder::Recorder;
 use crate::gpu::{Buffer, Gpu, PendingRead, Pipeline};
-use crate::packing::{self, LazyPacker, Output};
+use crate::packing::{Format, Output, Reader};
 use crate::splat::buffers::{ImageBuffers, Scratch, ScratchSize, SplatBuffers, n_bins, n_tiles};
 use crate::splat::kernels::DrawPipelines;
 use crate::splat::params::{Camera, Supervision, View, status};
 use crate::splat::passes::ViewPasses;
-use crate::{Error, Packing, Picture, QueuedPicture, Rendered};
+use crate::{Error, Packing, QueuedPicture, Rendered};
 
 /// Minimum capacity of the bin lists, in entries.
 const MIN_ENTRIES: u32 = 1 << 14;
@@ -24,7 +24,7 @@ pub(super) struct Renderer {
     background: Buffer,
     /// Buffer for images uploaded for comparison, kept for reuse.
     compared: Option<Buffer>,
-    packer: LazyPacker,
+    reader: Reader,
 }
 
 /// A view to draw.
@@ -56,29 +56,26 @@ impl Renderer {
             view: gpu.uniform_with("splat.draw_view", &<View as bytemuck::Zeroable>::zeroed()),
             background: gpu.uniform_with("splat.background", &<Supervision as bytemuck::Zeroable>::zeroed()),
             compared: None,
-            packer: LazyPacker::default(),
+            reader: Reader::default(),
         })
     }
 
-    /// Draws a picture.
+    /// Draws a view, and returns the picture if it is complete.
     pub(super) fn picture(
         &mut self,
         recorder: &mut Recorder,
         drawn: DrawnView<'_>,
         output: Output,
-    ) -> Result<Rendered, Error> {
-        let size_px = drawn.camera.size_px;
-        let output = self.packer.available(&recorder.gpu, &mut recorder.passes, output, size_px)?;
-        let take = |parts: &[&[u8]]| match output {
-            Output::Picture { .. } => Some(Rendered::Picture(Picture::from_parts(size_px, parts))),
-            Output::Packed(packing) => packing::unpack(packing, size_px, parts).map(Rendered::Packed),
-        };
-        match (self.draw(recorder, drawn, ReadParts::Picture(output), take)?, output, &self.image_buffers) {
-            (None, Output::Packed(Packing { depth, .. }), Some(ImageBuffers { pixels, depths, .. })) => {
+    ) -> Result<Option<Rendered>, Error> {
+        let view_px = drawn.camera.size_px;
+        let output = self.reader.available(&recorder.gpu, &mut recorder.passes, output, view_px)?;
+        let take = |parts: &[&[u8]]| output.is_complete().then(|| Reader::take(output, view_px, parts));
+        match (self.draw(recorder, drawn, ReadParts::Picture(output), take)?, &self.image_buffers) {
+            (Some(None), Some(ImageBuffers { pixels, depths, .. })) => {
                 let Recorder { gpu, passes } = recorder;
-                packing::read_picture(gpu, passes, size_px, [pixels, depths], depth).map(Rendered::Picture)
+                self.reader.read_unpacked(gpu, passes, output, view_px, [pixels, depths]).map(Some)
             }
-            (rendered, ..) => rendered.ok_or(Error::DeviceLost),
+            (taken, _) => Ok(taken.flatten()),
         }
     }
 
@@ -124,8 +121,8 @@ impl Renderer {
         packing: Packing,
         size_px: [u32; 2],
     ) -> Result<bool, Error> {
-        let output = self.packer.available(&recorder.gpu, &mut recorder.passes, Output::Packed(packing), size_px)?;
-        Ok(matches!(output, Output::Packed(_)))
+        let output = self.reader.available(&recorder.gpu, &mut recorder.passes, Output::packed(packing), size_px)?;
+        Ok(matches!(output.format, Format::Packed(_)))
     }
 
     /// Starts to draw and pack a picture.
@@ -135,7 +132,7 @@ impl Renderer {
         drawn: DrawnView<'_>,
         packing: Packing,
     ) -> Result<QueuedPicture, Error> {
-        let read = self.submit(recorder, drawn, ReadParts::Picture(Output::Packed(packing)))?;
+        let read = self.submit(recorder, drawn, ReadParts::Picture(Output::packed(packing)))?;
         Ok(QueuedPicture::packed(read, is_complete, packing, drawn.camera.size_px))
     }
 
@@ -186,13 +183,9 @@ impl Renderer {
         passes.finish(list, &self.pipelines, &self.background);
         let mut read = vec![(status, 4 * status::LEN)];
         match parts {
-            ReadParts::Picture(Output::Picture { depth }) => {
-                let depths = depth.then_some(&image_buffers.depths);
-                read.extend(Picture::buffers(size_px, &image_buffers.pixels, depths));
-            }
-            ReadParts::Picture(Output::Packed(packing)) => {
+            ReadParts::Picture(output) => {
                 let canvas = [&image_buffers.pixels, &image_buffers.depths];
-                read.extend(self.packer.get(gpu)?.record(gpu, list, packing, size_px, canvas)?);
+                read.extend(self.reader.record(gpu, list, output, size_px, canvas)?);
             }
             ReadParts::Comparison { score, image } => {
                 let n_bytes = products::record(gpu, list, score, (view, image_buffers), size_px, image);

@@ -15,13 +15,13 @@ impl TsdfModel {
         camera: &Camera,
         background_srgb: [f32; 3],
         output: Output,
-    ) -> Result<Rendered, Error> {
+    ) -> Result<Option<Rendered>, Error> {
         if !self.record_picture(camera, background_srgb)? {
             return Ok(Rendered::empty(camera.size_px, background_srgb, output));
         }
         let canvas = self.canvas.as_ref().ok_or(Error::DeviceLost)?;
         let canvas = [&canvas.pixels, &canvas.depths];
-        self.packer.read(&self.gpu, &mut self.passes, output, camera.size_px, canvas)
+        self.reader.read(&self.gpu, &mut self.passes, output, camera.size_px, canvas)
     }
 
     /// Renders a pinhole view without reading it back, and returns its GPU time in milliseconds. Returns `None` if the

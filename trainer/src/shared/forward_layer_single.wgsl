@@ -1,0 +1,36 @@
+// forward_layer: evaluates one layer. The outputs may be the inputs of the next layer.
+//
+// Inputs and weights are plain f16.
+
+fn put_residual(at: u32, i: u32, value: f32) {}
+
+fn put_residuals(at: u32, value: vec4f) {}
+
+fn evaluate_layer(layer: Layer, tile: u32, lane: u32) {
+    let n_words = layer.n_in / 4u;
+    for (var row = 16u * subgroup; row < layer.n_out; row += 16u * n_subgroups) {
+        var left: coop_mat16x16<f32, C>; // samples
+        var right: coop_mat16x16<f32, C>;
+        for (var k = 0u; k < layer.n_in; k += 16u) {
+            let first = layer.first_weight + row * n_words + k / 4u;
+            let w = coopLoadT<coop_mat16x16<f16, A>>(&weights[first], n_words);
+            let x_left = coopLoadT<coop_mat16x16<f16, B>>(&wg_halves[k * HALF_STRIDE], HALF_STRIDE);
+            let x_right = coopLoadT<coop_mat16x16<f16, B>>(&wg_halves[k * HALF_STRIDE + 4u], HALF_STRIDE);
+            left = coopMultiplyAdd(w, x_left, left);
+            right = coopMultiplyAdd(w, x_right, right);
+        }
+        coopStoreT(left, &wg_sums[row * STRIDE], STRIDE);
+        coopStoreT(right, &wg_sums[row * STRIDE + 4u], STRIDE);
+    }
+    // The sums are complete before they are read, and the inputs were read before they are overwritten.
+    workgroupBarrier();
+    if layer.stored_row != NOT_STORED {
+        for (var item = lane; item < layer.n_out * PARTS; item += LANES) {
+            let row = item / PARTS;
+            let part = item % PARTS;
+            put_four(0u, row, part, layer_output(layer, tile, row, part, out_four(0u, row, part)));
+        }
+        // The rows are written before the next layer reads them, and the sums were read before it overwrites them.
+        workgroupBarrier();
+    }
+}
