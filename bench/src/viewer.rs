@@ -39,11 +39,13 @@ pub struct ViewerOptions {
     pub size_px: [u32; 2],
     /// All directions around a point in the scene (equirectangular) instead of a pinhole view from outside.
     pub is_panorama: bool,
+    /// Minimum time between two requests; zero: each request follows the previous picture at once.
+    pub period: Duration,
 }
 
 impl Default for ViewerOptions {
     fn default() -> Self {
-        Self { size_px: [960, 720], is_panorama: false }
+        Self { size_px: [960, 720], is_panorama: false, period: Duration::ZERO }
     }
 }
 
@@ -228,6 +230,7 @@ impl Client {
                 encode_millis: millis("encode_millis"),
                 n_keyframes: header["keyframes"].as_u64().unwrap_or_default(),
             });
+            std::thread::sleep(self.options.period.saturating_sub(self.requested.elapsed()));
             self.request_picture()?;
         }
         Ok(())

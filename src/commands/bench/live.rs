@@ -12,6 +12,7 @@ use capture::{Rig, open};
 use session::run_folder::CreatedFolders;
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 /// Flags of `bench live`.
 #[derive(Debug, clap::Args)]
@@ -37,6 +38,9 @@ pub(crate) struct Args {
     /// Request panoramas (equirectangular) instead of pinhole views
     #[arg(long)]
     panorama: bool,
+    /// Pictures that each viewer requests per second, if they arrive that fast [default: back to back]
+    #[arg(long, value_name = "HZ", value_parser = super::super::number_in_range(0.1..=1000.0))]
+    picture_rate: Option<f64>,
     /// Repeat the run with one viewer and a wrong hand-eye calibration: degrees and millimeters in random directions
     #[arg(long, value_name = "DEG,MM", value_parser = hand_eye_error)]
     hand_eye_error: Option<(f64, f64)>,
@@ -153,7 +157,8 @@ impl Args {
         let flags = run_flags::parse(&rig_file, self.seconds, (&out, self.json), flags, &self.run_flags)?;
         let mut running = run::start(&flags, None, &mut CreatedFolders::default())?;
         let address = running.server.address();
-        let options = ViewerOptions { size_px: self.size, is_panorama: self.panorama };
+        let period = self.picture_rate.map_or(Duration::ZERO, |rate_hz| Duration::from_secs_f64(1.0 / rate_hz));
+        let options = ViewerOptions { size_px: self.size, is_panorama: self.panorama, period };
         let viewers: Vec<Viewer> =
             (0..conditions.n_viewers).map(|_| Viewer::connect(address, options)).collect::<bench::Result<_>>()?;
         let mut timeline = Timeline::default();

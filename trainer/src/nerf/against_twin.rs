@@ -253,7 +253,7 @@ fn colors_and_gradients_match_twin() {
     }
 }
 
-/// Colors of pictures differ by what the samples between two selected ones add.
+/// Rendered colors differ from the twin because skipped samples take the color of the selected one.
 #[test]
 fn pictures_match_twin() {
     let (twin, rays) = (field(7), rays());

@@ -55,7 +55,7 @@ pub(crate) struct FieldMoments {
 /// Occupancy grid: the cells in which rays are sampled.
 #[derive(Debug)]
 pub(crate) struct Occupancy {
-    /// Bits of cells, groups and blocks: a set of those to sample, and a set of solid ones; see `cell_blocks.wgsl`.
+    /// Two bit sets (cells to sample; solid cells), each with cells, groups and blocks; see `cell_blocks.wgsl`.
     pub(crate) occupied: Buffer,
     /// One f32 per cell: its recent opacity over one step; negative: never updated; 0: outside all views.
     pub(crate) cell_occupancy: Buffer,

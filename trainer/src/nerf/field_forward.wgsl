@@ -1,11 +1,11 @@
 // field_forward: density and color of every sample, before the exponential and the sigmoid.
 //
-// threads   LANES per 32 samples; a workgroup continues with further samples if there are fewer workgroups
+// threads   LANES per 32 samples; workgroups loop if there are more samples
 // reads     batch, levels [n_levels], grid [n_entries], weights, spans; if DENSITY: points [n_samples] (in the unit
 //           cube); if COLORS: rays, image_params [n_images, IMAGE_PARAM_STRIDE] (the embedding of images past the end is
 //           zero); if COLORS and not DENSITY: geometry of each span's `sample`
-// writes    if DENSITY: log_density [n_samples]; if STORE_GEOMETRY: geometry [n_samples, 4] (outputs of the first
-//           network); if COLORS: colors [n_samples]; if STORE_ACTIVATIONS: activations [n_tiles, n_activation_rows, 8]
+// writes    if DENSITY: log_density [n_samples]; if STORE_GEOMETRY: geometry [n_samples, 4] (outputs of the
+//           density network); if COLORS: colors [n_samples]; if STORE_ACTIVATIONS: activations [n_tiles, n_activation_rows, 8]
 //           (four samples)
 // twin      nerf/reference/field.rs
 // source    Mueller et al. 2022

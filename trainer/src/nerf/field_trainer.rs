@@ -36,10 +36,11 @@ const UPDATED_FRAC: f64 = 0.25;
 const MAX_SAMPLES_OVER_MEAN: u32 = 4;
 /// Samples per round for a ray of a picture; `MAX_SAMPLES_PER_ROUND` of `find_samples.wgsl`.
 const SAMPLES_PER_ROUND: u32 = 8;
-/// Maximum number of rounds, which limits the length of rays; and the number for the first picture.
+/// Maximum number of rounds, which limits the length of rays.
 const MAX_ROUNDS: u32 = 256;
+/// Number of rounds for the first picture.
 const FIRST_ROUNDS: u32 = 16;
-/// Pixels along an axis for one ray that finds where surfaces begin; `FRONT_STRIDE` of `picture_rays.wgsl`.
+/// The prepass traces one ray per square of this many pixels; `FRONT_STRIDE` of `picture_rays.wgsl`.
 const FRONT_STRIDE: u32 = 4;
 /// Initial range of the entries (Mueller et al. 2022, section 4).
 const INITIAL_ENTRY_RANGE: f64 = 1e-4;
@@ -376,7 +377,7 @@ impl FieldTrainer {
         Ok(())
     }
 
-    /// Records both networks as pictures use them, with the colors of all samples of the last step.
+    /// Records both networks with the kernels for rendering, for every sample of the last step.
     pub(crate) fn record_colors(&mut self, gpu: &Gpu) -> Result<(), Error> {
         let NerfBudget { n_rays, n_samples, .. } = self.sizes.nerf_budget;
         let canvas = Canvas::new(gpu, &self.compiled.widths, self.field.n_entries, n_rays.into(), n_rays, n_samples)?;

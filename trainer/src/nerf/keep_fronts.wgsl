@@ -1,8 +1,8 @@
-// keep_fronts: keeps the distances at which rays begin to meet something.
+// keep_fronts: keeps the distances at which the accumulated weights of rays first reach MIN_WEIGHT.
 //
 // threads   one per ray
 // reads     batch, march (first_ray: the first pixel in `pixel_order`; pixel_stride), view, rays, light
-// writes    fronts [height, width] (distance along the ray; FAR_FRONT if it meets nothing, 0 if unknown)
+// writes    fronts [height, width] (distance along the ray; FAR_FRONT if it hits no surface, 0 if unknown)
 
 #import view
 #import pixel_order

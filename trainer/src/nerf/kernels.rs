@@ -47,7 +47,7 @@ macro_rules! layers {
 /// Variants with f32 layers, and with f16 cooperative matrices.
 const FULL: &[Source] = layers!("full");
 const HALF: &[Source] = layers!("half");
-/// For pictures: without the rounding errors of the f16 numbers.
+/// For rendering: entries of the grid as two f16, and layers with single f16 numbers.
 const FULL_PICTURE: &[Source] = layers!("full", "full", "packed");
 const HALF_PICTURE: &[Source] = layers!("half", "single", "packed");
 

@@ -34,7 +34,7 @@ pub(crate) struct Canvas {
     pub(crate) image_params: Buffer,
     /// Color, transmittance, distance and front of the rays of a batch.
     pub(crate) light: Buffer,
-    /// Distances at which every fourth ray along x and y meets something.
+    /// Distances at which the weights of every fourth ray along x and y first reach 1/64.
     fronts: Buffer,
     /// Per batch of rays: samples in its last round, and rounds that had samples.
     pub(crate) progress: Buffer,
@@ -81,7 +81,7 @@ impl Canvas {
 
 /// Layers of both networks.
 const N_LAYERS: u64 = 5;
-/// Maximum number of workgroups that evaluate the networks: enough for any GPU, and few if there are few samples.
+/// Maximum number of workgroups that evaluate the networks; they process larger batches in a loop.
 const MAX_NETWORK_GROUPS: u64 = 8192;
 /// Byte range of the number of samples in a batch.
 const N_SAMPLES_BYTES: Range<u64> = 4..8;
@@ -178,7 +178,7 @@ impl FieldPasses<'_> {
         }
     }
 
-    /// Converts weights and grid to the number types of pictures.
+    /// Converts weights and grid to the precision used for rendering.
     pub(crate) fn convert_for_picture(&self, list: &mut Passes, canvas: &Canvas) {
         self.convert_weights(list);
         let Self { gpu, pipelines, field, .. } = *self;
@@ -289,7 +289,7 @@ impl FieldPasses<'_> {
         list.dispatch(gpu, &pipelines.find_samples, groups(slot.n_rays, 256), &found);
     }
 
-    /// Keeps the distances at which the rays meet something.
+    /// Keeps the distances at which the weights of the rays first reach 1/64.
     pub(crate) fn keep_fronts(&self, list: &mut Passes, canvas: &Canvas) {
         let Self { gpu, pipelines, samples, slot, .. } = *self;
         let kept = [

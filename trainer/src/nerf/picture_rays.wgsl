@@ -1,12 +1,11 @@
 // picture_rays: generates the rays for a range of pixels of a view.
 //
-// A picture is rendered twice. The first time, with every fourth pixel along x and y, it yields the distances at which
-// surfaces begin. The second time, rays skip the thin haze in front of them, but no solid cell: a thin object may lie
-// between the rays of the first time.
+// The first pass renders every fourth pixel along x and y, which gives the distances of surfaces. In the second pass, rays
+// skip the haze in front of them, but no solid cell: a thin object may lie between the rays of the first pass.
 //
 // threads   one per ray
 // reads     batch, march (first_ray: the first pixel in `pixel_order`; pixel_stride), view (in units of the scene radius around its
-//           center), fronts (of the first time)
+//           center), fronts (of the first pass)
 // writes    rays, light [n_rays, 2] (reset: nothing accumulated)
 
 #import view
@@ -29,7 +28,7 @@ const FRONT_STRIDE = 4u;
 const FRONT_MARGIN = 0.005;
 const FRONT_MARGIN_STEPS = 1.5;
 
-// Distance from which on all occupied cells are sampled: before the fronts around the pixel.
+// Distance beyond which all occupied cells are sampled; before it, only solid cells.
 fn start_of(pixel: vec2u) -> f32 {
     let size = (view.size_px + FRONT_STRIDE - 1u) / FRONT_STRIDE;
     let at = vec2i(pixel / FRONT_STRIDE);

@@ -1,8 +1,8 @@
 // select_samples: composites the densities of one more round of samples, marks rays that are finished, and selects the
 // samples whose colors are evaluated.
 //
-// A selected sample also represents the samples since the previous selected one, which add little: most samples of a
-// ray lie in front of or behind its surface.
+// The color of a selected sample stands for the samples since the previous selected one, which contribute little: most
+// samples of a ray lie in front of or behind its surface.
 //
 // threads   one per ray
 // reads     march (max_found: samples per round), spans, log_density [n_samples]
@@ -48,7 +48,7 @@ struct Progress {
     transmittance: f32,
     distance: f32,
     pending: f32,          // weight since the last selected sample
-    front: f32,            // begin of the first selected sample
+    front: f32,            // start of the first selected sample
 }
 
 // Adds a sample. Returns the weight that the sample represents if it is selected, else 0.

@@ -28,11 +28,11 @@ pub(crate) enum Format {
     Packed(Packing),
 }
 
-/// What happens to a drawn pinhole view.
+/// How a rendered pinhole view is output.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Output {
     pub(crate) format: Format,
-    /// If it is a face of a panorama. Only the last face reads the panorama back.
+    /// Set for a face of a panorama; only the last face is read back.
     face: Option<Face>,
 }
 
@@ -396,7 +396,7 @@ impl Packer {
     }
 }
 
-/// Reads pictures back. What this needs is created when a picture needs it.
+/// Reads pictures back. Packer and panorama buffers are created on first use.
 #[derive(Debug, Default)]
 pub(crate) struct Reader {
     packer: Option<Packer>,
@@ -404,13 +404,6 @@ pub(crate) struct Reader {
 }
 
 impl Reader {
-    fn packer(&mut self, gpu: &Gpu) -> Result<&mut Packer, Error> {
-        if self.packer.is_none() {
-            self.packer = Some(Packer::new(gpu)?);
-        }
-        self.packer.as_mut().ok_or(Error::DeviceLost)
-    }
-
     /// The same output, or an unpacked picture if the adapter is a CPU or GPU memory is too small for packing.
     pub(crate) fn available(
         &mut self,
@@ -424,7 +417,7 @@ impl Reader {
         if gpu.is_software() {
             return Ok(unpacked); // Kernels would take longer than the encoders of the server.
         }
-        match self.packer(gpu)?.reserve(gpu, passes, Sizes::of(output.size_px(view_px))) {
+        match created(&mut self.packer, gpu)?.reserve(gpu, passes, Sizes::of(output.size_px(view_px))) {
             Err(error) if error.is_out_of_memory() => Ok(unpacked),
             reserved => reserved.map(|()| output),
         }
@@ -449,9 +442,7 @@ impl Reader {
         match output.format {
             _ if !output.is_complete() => Ok(Vec::new()),
             Format::Picture { depth } => Ok(Picture::buffers(size_px, canvas[0], depth.then_some(canvas[1]))),
-            Format::Packed(packing) => {
-                packer.as_mut().ok_or(Error::DeviceLost)?.record(gpu, passes, packing, size_px, canvas)
-            }
+            Format::Packed(packing) => created(packer, gpu)?.record(gpu, passes, packing, size_px, canvas),
         }
     }
 
@@ -502,6 +493,14 @@ impl Reader {
         let taken = read.finish_with(gpu, |parts| Self::take(output, view_px, parts))?;
         taken.map_or_else(|| self.read_unpacked(gpu, passes, output, view_px, canvas), Ok).map(Some)
     }
+}
+
+/// The packer, created on first use.
+fn created<'a>(packer: &'a mut Option<Packer>, gpu: &Gpu) -> Result<&'a mut Packer, Error> {
+    if packer.is_none() {
+        *packer = Some(Packer::new(gpu)?);
+    }
+    packer.as_mut().ok_or(Error::DeviceLost)
 }
 
 /// Assembles the data read back from [`Packer::record`]. `None` if the JPEG file was too long.

@@ -14,7 +14,7 @@ fn group_cells_of(n_cells: u32) -> u32 {
     return max(n_cells / MAX_GROUPS, 1u);
 }
 
-// Words of the bits of all boxes of the given number of cells along an axis.
+// Number of words for one bit per box of `side` cells along an axis.
 fn n_words_of(n_cells: u32, side: u32) -> u32 {
     let n = n_cells / side;
     return (n * n * n + 31u) / 32u;

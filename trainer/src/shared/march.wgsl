@@ -69,7 +69,7 @@ fn middle_of(march: March, ray: Ray, path: Path, ix: u32) -> vec3f {
     return ray.origin + distance * ray.direction;
 }
 
-// Begin and end of a segment along the ray.
+// Start and end of a segment along the ray.
 fn segment_of(march: March, ray: Ray, path: Path, ix: u32) -> vec2f {
     let steps = f32(ix) + ray.jitter;
     return vec2f(distance_at(march, path, steps), distance_at(march, path, steps + 1.0));
@@ -80,11 +80,11 @@ fn bit_of(first_word: u32, box: vec3u, log2_n: u32) -> bool {
     return (occupied[first_word + ix / 32u] >> (ix % 32u) & 1u) == 1u;
 }
 
-// Whether the line between two points outside the inner cube contracts to a curve in the box [low, high] of the
-// contracted space [-2, 2]^3; the first point is in it.
+// Whether the contraction of the segment from `first` to `last`, both outside the inner cube, lies inside the box
+// [low, high] of the contracted space [-2, 2]^3; `first` does. Conservative: false if the dominant coordinate changes.
 //
-// If the same coordinate m is largest at both points, it is largest between them, and any coordinate is p = a m + b. With
-// u = 1 / m, it contracts to (2 - u) (a + b u), which has one extremum, at u = 1 - a / (2 b).
+// If coordinate m is dominant (largest magnitude, same sign) at both points, so it is between them, and any coordinate is
+// p = a m + b. With u = 1 / m, it contracts to (2 - u) (a + b u), which has one extremum, at u = 1 - a / (2 b).
 fn stays_in_box(first: vec3f, last: vec3f, low: vec3f, high: vec3f) -> bool {
     let size = abs(first);
     let m = max(size.x, max(size.y, size.z));
@@ -116,7 +116,7 @@ fn visit(march: March, boxes: Boxes, ray: Ray, path: Path, ix: u32, end_ix: u32,
     if !is_inside { at = contract(middle); }
     let cell = min(vec3u(at * f32(march.n_cells)), vec3u(march.n_cells - 1u));
     let first_word = select(0u, boxes.set_words, ix < free_ix);
-    // The largest empty box around the segment.
+    // The largest empty box around the segment's midpoint.
     var log2_side = boxes.log2_block;
     if bit_of(first_word + boxes.block_word, cell >> vec3u(log2_side), boxes.log2_cells - log2_side) {
         log2_side = boxes.log2_group;

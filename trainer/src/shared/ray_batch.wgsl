@@ -34,5 +34,5 @@ struct Span {
 const RAY_RUNNING = 0u;
 const RAY_ENDED = 1u;
 const RAY_SHOWN = 2u;
-// Distance at which a ray of a picture meets something, if it meets nothing.
+// Front distance of a ray that hits no surface.
 const FAR_FRONT = 1e9;
