@@ -214,7 +214,8 @@ impl Client {
         ensure!(n_header <= n_bytes.saturating_sub(4).min(MAX_HEADER_BYTES), "a header of {n_header} bytes");
         let header: Value = serde_json::from_reader((&mut self.reader).take(n_header))?;
         self.skip(n_bytes.saturating_sub(4 + n_header))?;
-        if header["type"] != "picture" {
+        // A picture of an earlier request may still arrive after an error.
+        if header["type"] != "picture" || header["id"] != self.n_requested.saturating_sub(1) {
             return Ok(());
         }
         let now = Instant::now();
