@@ -19,6 +19,7 @@
 //! # Ok::<(), session::Error>(())
 //! ```
 
+pub mod calibration_report;
 pub mod camera_list;
 pub mod camera_path;
 pub mod chart;
@@ -33,6 +34,7 @@ mod error;
 pub mod evaluate;
 pub mod evaluation_schedule;
 mod gpu_loss;
+mod inline_picture;
 mod ledger;
 mod live;
 pub mod methods;

@@ -28,6 +28,7 @@ mod tests;
 pub use closed_form::ClosedForm;
 pub(crate) use closed_form::nearest_rotation;
 pub use evaluation::Scatter;
+pub use excitation::RotationExcitation;
 pub use next_poses::{NextPose, NextPoseOptions, suggest_next_poses};
 pub use pose_fit::HandEyeNoise;
 pub use refusal::Refusal;

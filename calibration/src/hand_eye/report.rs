@@ -7,8 +7,8 @@ use super::mistakes;
 use super::pose_fit::{self, HandEyeNoise, Measurement};
 use super::refine::{self, Refined};
 use super::{HandEyeInput, Setup};
-use crate::Error;
 use crate::least_squares::sigma_of;
+use crate::{BoardPoint, Error, PointFit};
 use kinematics::{Intrinsics, Transform};
 use nalgebra::Matrix6;
 
@@ -88,6 +88,11 @@ pub struct SampleReport {
     pub normalized: Option<f64>,
     /// RMS reprojection error, pixels.
     pub rms_px: Option<f64>,
+    /// Origin of the board according to this sample minus that of the result, millimeters along the axes of the base
+    /// (eye in hand) or the flange (eye to hand).
+    pub board_offset_mm: Option<[f64; 3]>,
+    /// Corners without outliers, with their reprojection errors. Empty for given poses.
+    pub points: Vec<PointFit>,
 }
 
 /// Largest standard deviation of a joint offset that counts as observable, radians or meters.
@@ -188,6 +193,8 @@ fn sample_reports(input: &HandEyeInput<'_>, refined: &Refined, without_board: &[
             rotation_deg: None,
             normalized: None,
             rms_px: None,
+            board_offset_mm: None,
+            points: Vec::new(),
         })
         .collect();
     debug_assert_eq!(refined.samples.len() + without_board.len(), reports.len(), "every sample is usable or not");
@@ -198,11 +205,20 @@ fn sample_reports(input: &HandEyeInput<'_>, refined: &Refined, without_board: &[
         report.rotation_deg = Some(residual.fixed_rows::<3>(0).norm().to_degrees());
         report.position_mm = Some(1e3 * residual.fixed_rows::<3>(3).norm());
         report.normalized = Some((refined.squared_distances[ix] / 6.0).sqrt());
+        let board = sample.a * refined.solution.x * sample.candidates[refined.choice[ix]].camera_from_board;
+        report.board_offset_mm =
+            Some(((board.translation.vector - refined.solution.y.translation.vector) * 1e3).into());
         let points = refine::corners(input, sample, refined.choice[ix]);
+        let pose = refine::predicted(&refined.solution, sample);
         report.rms_px = refined.intrinsics.as_ref().filter(|_| !points.is_empty()).map(|intrinsics| {
-            let pose = refine::predicted(&refined.solution, sample);
             (evaluation::reprojection_squares(&pose, &points, intrinsics) / points.len() as f64).sqrt()
         });
+        let fit = |point: &BoardPoint| {
+            let in_camera = (pose * nalgebra::Point3::from(point.point_in_board)).coords;
+            let [u, v] = refined.intrinsics.as_ref()?.project(&in_camera)?;
+            Some(PointFit { pixel: point.pixel, residual_px: [point.pixel[0] - u, point.pixel[1] - v] })
+        };
+        report.points = points.iter().filter_map(fit).collect();
     }
     reports
 }

@@ -243,6 +243,8 @@ fn draw_legend(legend: &[Entry], plot: &Plot, shapes: &mut Vec<VectorShape>) {
     }
 }
 
+/// Lines with more points have no dots, which would hide the line.
+const MAX_DOTS: usize = 100;
 const PEER_DASH: [f64; 2] = [6.0, 3.0];
 
 fn color_of(line_ix: usize) -> Color {
@@ -264,8 +266,8 @@ fn draw_line(line: &Line, ix: usize, plot: &Plot, shapes: &mut Vec<VectorShape>)
     if points.len() > 1 {
         shapes.push(VectorShape::Line { points: points.clone(), color: color_of(ix), width: 2.0, dash });
     }
-    for at in points {
-        draw_dot(at, ix, shapes);
+    if points.len() <= MAX_DOTS {
+        points.into_iter().for_each(|at| draw_dot(at, ix, shapes));
     }
 }
 

@@ -3,7 +3,9 @@
 mod hand_eye;
 mod images;
 mod intrinsics;
+mod json_object;
 mod lens;
+mod outputs;
 mod scene;
 mod target;
 mod time_offset;

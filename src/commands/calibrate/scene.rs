@@ -1,5 +1,6 @@
 //! `fieldrig calibrate scene`: calibrates the cameras of a rig from images of a static scene.
 
+use super::outputs::{self, ReportFlag};
 use super::{matrix_of, print_matrix};
 use crate::console::ReadBar;
 use crate::exit::{self, BadArgument, Exit, InsufficientData};
@@ -11,6 +12,7 @@ use drivers::Sample;
 use keyframe::listed;
 use kinematics::Stamp;
 use serde::Serialize;
+use session::calibration_report::SceneReport;
 use session::{Data, DataOptions, Purpose, Refine, SCENE_PARAMS, SceneCalibration, calibrate_scene, corrected_rig};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -43,6 +45,8 @@ pub(crate) struct Args {
     /// Write the rig file with the accepted corrections. An existing file is kept with the extension .old
     #[arg(long, value_name = "FILE")]
     write_rig: Option<PathBuf>,
+    #[command(flatten)]
+    report: ReportFlag,
     /// Print one JSON object
     #[arg(long)]
     json: bool,
@@ -84,6 +88,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     if args.params.len() > 1 && args.params.contains(&Refine::Auto) {
         return Err(BadArgument("--params: auto cannot be combined with other values".into()).into());
     }
+    let report = args.report.open()?;
     let given = args.rig_as_given()?;
     if let Some(file) = &args.write_rig {
         let Some(rig) = &given else {
@@ -95,13 +100,13 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let data = args.data()?;
     // Devices may report calibration that the rig file does not contain.
     let rig = if args.sim || data.rig.is_none() || !is_rig_file(&args.input) { given } else { data.rig.clone() };
-    let calibration = calibrate_scene(&data, &args.params, rig.as_ref())?;
-    let exit = exit::from_losses(&data.data_losses);
-    let mut printed = printed(&data, &calibration, calibration.is_refused(&data));
-    let alignment = &calibration.alignment;
-    if alignment.estimates.is_empty() && !alignment.has_enough_validation_images() {
-        printed.refused = Some("too few validation images to accept a correction; record more images".to_owned());
+    let result = calibrate_scene(&data, &args.params, rig.as_ref()).map_err(anyhow::Error::from);
+    if let Some(path) = report {
+        args.write_report(path, &data, rig.as_ref(), &result)?;
     }
+    let calibration = result?;
+    let exit = exit::from_losses(&data.data_losses);
+    let printed = printed(&data, &calibration, refusal(&data, &calibration));
     let is_refused = printed.refused.is_some();
     if args.json {
         print::json(&printed)?;
@@ -126,6 +131,16 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     Ok(exit)
 }
 
+/// Why no camera could be calibrated; `None` if one could.
+fn refusal(data: &Data, calibration: &SceneCalibration) -> Option<String> {
+    let alignment = &calibration.alignment;
+    if alignment.estimates.is_empty() && !alignment.has_enough_validation_images() {
+        return Some("too few validation images to accept a correction; record more images".to_owned());
+    }
+    let reasons = calibration.refused.iter().map(|(camera, reason)| format!("camera {camera:?}: {reason}"));
+    calibration.is_refused(data).then(|| reasons.collect::<Vec<_>>().join("; "))
+}
+
 fn scene_param(text: &str) -> Result<Refine, String> {
     SCENE_PARAMS.into_iter().find(|param| param.name() == text).ok_or_else(|| {
         let names = SCENE_PARAMS.map(Refine::name);
@@ -138,9 +153,37 @@ impl Args {
         DataOptions { keyframes: self.keyframes.clone(), rig: self.rig.clone(), ..DataOptions::default() }
     }
 
+    fn write_report(
+        &self,
+        path: &Path,
+        data: &Data,
+        rig: Option<&Rig>,
+        result: &anyhow::Result<SceneCalibration>,
+    ) -> anyhow::Result<()> {
+        let calibration = result.as_ref().ok();
+        let Some(mut heading) = outputs::heading(&self.input, result, data.data_losses.clone()) else { return Ok(()) };
+        if let Some(calibration) = calibration {
+            heading.refused = refusal(data, calibration);
+            let kept = calibration
+                .refused
+                .iter()
+                .map(|(camera, reason)| format!("camera {camera:?} keeps its extrinsics: {reason}"));
+            heading.warnings.extend(kept.filter(|_| heading.refused.is_none()));
+        }
+        let mut n_images: BTreeMap<String, usize> = BTreeMap::new();
+        for keyframe in &data.keyframes {
+            *n_images.entry(keyframe.camera.to_string()).or_default() += 1;
+        }
+        let n_images: Vec<(String, usize)> = n_images.into_iter().collect();
+        let report = SceneReport { heading: &heading, rig, n_images: &n_images, calibration };
+        outputs::write_report(path, &report.html())
+    }
+
     /// The rig file, without settings that apply only to this command; `None` for a folder.
     fn rig_as_given(&self) -> anyhow::Result<Option<Rig>> {
-        session::expect(&self.input)?;
+        if !self.input.exists() {
+            return Err(BadArgument(format!("{} does not exist", self.input.display())).into());
+        }
         if is_rig_file(&self.input) {
             return Ok(Some(Rig::load(&self.input, &[])?));
         }
@@ -177,7 +220,7 @@ fn is_rig_file(path: &Path) -> bool {
     path.extension().is_some_and(|extension| extension == "toml")
 }
 
-fn printed<'a>(data: &Data, calibration: &'a SceneCalibration, is_refused: bool) -> Printed<'a> {
+fn printed<'a>(data: &Data, calibration: &'a SceneCalibration, refused: Option<String>) -> Printed<'a> {
     let cameras = calibration.rig.iter().flat_map(|rig| &rig.cameras).map(|camera| {
         let printed = PrintedCamera {
             n_images: data.keyframes.iter().filter(|keyframe| *keyframe.camera == *camera.name).count(),
@@ -190,7 +233,6 @@ fn printed<'a>(data: &Data, calibration: &'a SceneCalibration, is_refused: bool)
         (&*camera.name, printed)
     });
     let alignment = &calibration.alignment;
-    let reasons = calibration.refused.iter().map(|(camera, reason)| format!("camera {camera:?}: {reason}"));
     Printed {
         n_images: data.keyframes.len(),
         cameras: cameras.collect(),
@@ -201,7 +243,7 @@ fn printed<'a>(data: &Data, calibration: &'a SceneCalibration, is_refused: bool)
         estimates: &alignment.estimates,
         trials: &alignment.trials,
         unobservable: alignment.unobservable.iter().map(ToString::to_string).collect(),
-        refused: is_refused.then(|| reasons.collect::<Vec<_>>().join("; ")),
+        refused,
     }
 }
 
