@@ -180,8 +180,16 @@ pub fn calibrate_hand_eye(input: &HandEyeInput<'_>) -> Result<HandEyeCalibration
         input.options.max_sigma_rad,
         input.setup == Setup::EyeInHand,
     )
-    .map_err(refused)?;
+    .map_err(|refusal| refused(with_doubt(refusal, refined.intrinsics_doubt.as_deref())))?;
     Ok(calibration)
+}
+
+/// The refusal of an uncertain result. Wrong intrinsics are the more likely reason if the corners contradict them.
+fn with_doubt(refusal: Refusal, doubt: Option<&str>) -> Refusal {
+    match doubt {
+        Some(doubt) => Refusal { motion: format!("{doubt}; otherwise, {}", refusal.motion), ..refusal },
+        None => refusal,
+    }
 }
 
 fn too_few(n: usize, what: &str) -> Refusal {

@@ -35,7 +35,8 @@ pub(super) struct Refined {
     pub(super) intrinsics_sigma: Vec<f64>,
     /// Offsets of the inner joints and their standard deviations.
     pub(super) joint_offsets: Vec<(f64, f64)>,
-    pub(super) warnings: Vec<String>,
+    /// Why the given intrinsics may be wrong.
+    pub(super) intrinsics_doubt: Option<String>,
 }
 
 impl Refined {
@@ -86,7 +87,7 @@ pub(super) fn refine(
             stage.fit.covariance += doubt.covariance(&stage.fit.solution);
         }
         let mut refined = finish(samples, choice, stage, closed_form, Some(given));
-        refined.warnings.extend(doubt.map(|doubt| doubt.warning));
+        refined.intrinsics_doubt = doubt.map(|doubt| doubt.warning);
         return Ok(refined);
     }
     let free = minimize_free(input, &mut samples, &mut choice, &mut stage, given)?;
@@ -173,9 +174,8 @@ impl IntrinsicsDoubt {
         (decrease > n_params + 6.0 * (2.0 * n_params).sqrt()).then_some(())?;
         let change = fixed.state.solution.x.inverse() * free.state.solution.x;
         let warning = format!(
-            "the corners contradict the given intrinsics: with free intrinsics, the focal length changes from {:.1} to {:.1} px, and the camera moves by {:.1} mm and {:.2} degrees, which is included in the uncertainty; calibrate the intrinsics, or estimate them here",
-            intrinsics.focal_px[0],
-            free.state.intrinsics.focal_px[0],
+            "the corners contradict the given intrinsics: with free intrinsics, {}, and the camera moves by {:.1} mm and {:.2} degrees, which is included in the uncertainty; calibrate the intrinsics, or estimate them here",
+            change_of_intrinsics(intrinsics, &free.state.intrinsics),
             1e3 * change.translation.vector.norm(),
             change.rotation.angle().to_degrees()
         );
@@ -193,6 +193,21 @@ impl IntrinsicsDoubt {
             shift.fixed_rows_mut::<3>(first + 3).copy_from(&change.translation.vector);
         }
         &self.free_covariance + &shift * shift.transpose()
+    }
+}
+
+/// The changes of focal length and principal point, the larger one first.
+fn change_of_intrinsics(given: &Intrinsics, free: &Intrinsics) -> String {
+    let largest = |a: [f64; 2], b: [f64; 2]| f64::max((a[0] - b[0]).abs(), (a[1] - b[1]).abs());
+    let [x, y] = [0, 1].map(|axis| free.principal_px[axis] - given.principal_px[axis]);
+    let focal = format!("the focal length changes from {:.1} to {:.1} px", given.focal_px[0], free.focal_px[0]);
+    let principal = format!(
+        "the principal point moves by ({x:.1}, {y:.1}) px from ({:.1}, {:.1})",
+        given.principal_px[0], given.principal_px[1]
+    );
+    match largest(given.principal_px, free.principal_px) > largest(given.focal_px, free.focal_px) {
+        true => format!("{principal}, {focal}"),
+        false => format!("{focal}, {principal}"),
     }
 }
 
@@ -462,7 +477,7 @@ fn finish(
         intrinsics,
         intrinsics_sigma: Vec::new(),
         joint_offsets: Vec::new(),
-        warnings: Vec::new(),
+        intrinsics_doubt: None,
     }
 }
 

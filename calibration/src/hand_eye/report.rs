@@ -238,7 +238,7 @@ fn joint_offsets(input: &HandEyeInput<'_>, refined: &Refined) -> Vec<JointOffset
 }
 
 fn warnings(input: &HandEyeInput<'_>, refined: &Refined, reports: &[SampleReport]) -> Vec<String> {
-    let mut warnings = refined.warnings.clone();
+    let mut warnings: Vec<String> = refined.intrinsics_doubt.clone().into_iter().collect();
     let named = |status: SampleStatus| -> Vec<&str> {
         reports.iter().filter(|report| report.status == status).map(|report| report.name.as_str()).collect()
     };

@@ -3,6 +3,7 @@
 //! The magnitude of the rotation rate of rigidly joined bodies is the same in every frame (Furrer et al. 2017, "Evaluation
 //! of combined time-offset estimation and hand-eye calibration on robotic datasets").
 
+use super::stamps;
 use super::stream::Stream;
 use crate::hand_eye::Refusal;
 
@@ -24,6 +25,12 @@ pub(super) fn correlate(a: &Stream, b: &Stream, max_offset_secs: Option<f64>) ->
     /// Lower maxima are not tried.
     const SIMILAR: f64 = 0.7;
     const MAX_OTHERS: usize = 4;
+    for (name, stream) in [("A", a), ("B", b)] {
+        let own = Grid::new(stream, stream);
+        if let (Some(refusal), Err(_)) = (stamps::unit_mistake(name, stream), own.rates[0].check_excitation(name)) {
+            return Err(refusal);
+        }
+    }
     let grid = Grid::new(a, b);
     for (name, rates) in [("A", &grid.rates[0]), ("B", &grid.rates[1])] {
         rates.check_excitation(name)?;
@@ -36,6 +43,9 @@ pub(super) fn correlate(a: &Stream, b: &Stream, max_offset_secs: Option<f64>) ->
         ));
     };
     if best.value < MIN_CORRELATION {
+        if let Some(refusal) = clock_rate_mistake(a, b) {
+            return Err(refusal);
+        }
         return Err(Refusal::new(
             format!(
                 "the rotation rates of the streams are not correlated (at most {:.2}; at least {MIN_CORRELATION} is needed)",
@@ -50,6 +60,22 @@ pub(super) fn correlate(a: &Stream, b: &Stream, max_offset_secs: Option<f64>) ->
         .chain(others.into_iter().filter(|other| other.value > SIMILAR * best.value).take(MAX_OTHERS))
         .map(|correlation| correlation.lag);
     Ok(lags.map(|lag| Coarse { offset_secs: grid.offset_secs(lag), step_secs: grid.step_secs }).collect())
+}
+
+/// Explanation by stamps that advance too fast or too slowly by a factor of two.
+pub(super) fn clock_rate_mistake(a: &Stream, b: &Stream) -> Option<Refusal> {
+    /// Unrelated motions of usual length do not reach it.
+    const MIN_CORRELATION: f64 = 0.7;
+    let correlation = |factor: f64| {
+        let correlations = Grid::new(a, &b.scaled(factor)).correlations(None);
+        correlations.iter().map(|correlation| correlation.value).fold(0.0, f64::max)
+    };
+    let words =
+        [(0.5, "twice"), (2.0, "half")].into_iter().find(|(factor, _)| correlation(*factor) > MIN_CORRELATION)?.1;
+    Some(Refusal::new(
+        format!("the stamps of stream B advance {words} as fast as those of stream A: only then do the motions agree"),
+        "check how the stamps were computed, for example from a frame number and a wrong frame rate",
+    ))
 }
 
 fn signed(n: usize) -> i64 {

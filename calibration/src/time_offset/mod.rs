@@ -6,6 +6,7 @@
 mod coarse;
 mod fine;
 mod profile;
+mod stamps;
 mod stream;
 #[cfg(test)]
 mod tests;
@@ -114,7 +115,10 @@ pub fn estimate_time_offset(
     let is_swapped = b.step_secs() < a.step_secs();
     let (interpolated, points) = if is_swapped { (&b, &a) } else { (&a, &b) };
     let sign = if is_swapped { -1.0 } else { 1.0 };
-    let (coarse, fine) = refine_best(interpolated, points, &coarse, sign)?;
+    let (coarse, fine) = refine_best(interpolated, points, &coarse, sign).map_err(|error| match &error {
+        Error::Refused(_) => coarse::clock_rate_mistake(&a, &b).map_or(error, refused),
+        _ => error,
+    })?;
     let offset_secs = sign * fine.offset_secs;
     if (offset_secs - coarse.offset_secs).abs() > 10.0 * coarse.step_secs {
         return Err(refused(Refusal::new(

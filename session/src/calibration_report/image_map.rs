@@ -21,15 +21,28 @@ impl Shade {
     }
 }
 
+/// A rectangle in an image: its first pixel and its size.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct ImagePart {
+    pub(super) first_px: [u32; 2],
+    pub(super) size_px: [u32; 2],
+}
+
 /// A picture with the coordinates of an image.
 pub(super) struct ImageMap {
+    first_px: [f64; 2],
     size_px: [f64; 2],
     shapes: String,
 }
 
 impl ImageMap {
     pub(super) fn new(size_px: [u32; 2]) -> Self {
-        Self { size_px: size_px.map(f64::from), shapes: String::new() }
+        Self::of_part(ImagePart { first_px: [0, 0], size_px })
+    }
+
+    /// A part of an image, in the coordinates of the whole image.
+    pub(super) fn of_part(ImagePart { first_px, size_px }: ImagePart) -> Self {
+        Self { first_px: first_px.map(f64::from), size_px: size_px.map(f64::from), shapes: String::new() }
     }
 
     /// Length in image pixels of one unit of line width.
@@ -37,11 +50,11 @@ impl ImageMap {
         self.size_px[0].max(self.size_px[1]) / 640.0
     }
 
-    /// Draws an embedded photo.
+    /// Draws an embedded photo of the part.
     pub(super) fn photo(&mut self, uri: &str) {
-        let [width, height] = self.size_px;
+        let ([x, y], [width, height]) = (self.first_px, self.size_px);
         self.push(&format!(
-            "<image width=\"{width}\" height=\"{height}\" preserveAspectRatio=\"none\" href=\"{uri}\"/>\n"
+            "<image x=\"{x}\" y=\"{y}\" width=\"{width}\" height=\"{height}\" preserveAspectRatio=\"none\" href=\"{uri}\"/>\n"
         ));
     }
 
@@ -78,7 +91,7 @@ impl ImageMap {
     /// Draws circles around detected corners and crosses at the predicted ones.
     pub(super) fn corners(&mut self, points: &[PointFit]) {
         let (mut circles, mut crosses) = (String::new(), String::new());
-        let (radius, arm) = (5.0 * self.unit(), 3.5 * self.unit());
+        let (radius, arm) = (7.0 * self.unit(), 5.0 * self.unit());
         for PointFit { pixel: [x, y], residual_px: [dx, dy] } in points {
             let (left, diameter) = (x - radius, 2.0 * radius);
             write!(circles, "M{left:.1} {y:.1}a{radius:.1} {radius:.1} 0 1 0 {diameter:.1} 0a{radius:.1} {radius:.1} 0 1 0 -{diameter:.1} 0")
@@ -90,7 +103,7 @@ impl ImageMap {
                     .expect("writing to a string cannot fail");
             }
         }
-        let width = 1.5 * self.unit();
+        let width = 2.0 * self.unit();
         self.push(&format!("<path class=\"detected\" d=\"{circles}\" stroke-width=\"{width:.2}\"/>\n"));
         self.push(&format!("<path class=\"predicted\" d=\"{crosses}\" stroke-width=\"{width:.2}\"/>\n"));
     }
@@ -131,11 +144,11 @@ impl ImageMap {
     }
 
     pub(super) fn svg(&self, label: &str) -> String {
-        let [width, height] = self.size_px;
+        let ([x, y], [width, height]) = (self.first_px, self.size_px);
         let label = crate::chart::drawing::escaped(label);
         format!(
-            "<svg class=\"map\" role=\"img\" aria-label=\"{label}\" viewBox=\"0 0 {width} {height}\">\n\
-             <rect class=\"frame\" width=\"{width}\" height=\"{height}\"/>\n{}</svg>\n",
+            "<svg class=\"map\" role=\"img\" aria-label=\"{label}\" viewBox=\"{x} {y} {width} {height}\">\n\
+             <rect class=\"frame\" x=\"{x}\" y=\"{y}\" width=\"{width}\" height=\"{height}\"/>\n{}</svg>\n",
             self.shapes
         )
     }

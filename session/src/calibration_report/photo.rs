@@ -1,6 +1,6 @@
 //! Photos of the target with detected and predicted corners.
 
-use super::image_map::ImageMap;
+use super::image_map::{ImageMap, ImagePart};
 use super::page;
 use crate::error::Context;
 use crate::inline_picture::{data_uri, fit_size};
@@ -16,12 +16,13 @@ const QUALITY: u8 = 78;
 /// Files of the images, by name.
 pub type Photos = BTreeMap<String, PathBuf>;
 
-/// A photo with corners drawn over it, and a caption. Empty if the photo cannot be read again.
+/// The part of a photo around the corners, with the corners drawn over it, and a caption. Without corners, the whole
+/// photo. Empty if the photo cannot be read again.
 pub(super) fn with_corners(photos: &Photos, name: &str, caption: &str, points: &[PointFit]) -> String {
     let Some(file) = photos.get(name) else { return String::new() };
-    match embedded(file) {
-        Ok((uri, size_px)) => {
-            let mut map = ImageMap::new(size_px);
+    match embedded(file, points) {
+        Ok((uri, part)) => {
+            let mut map = ImageMap::of_part(part);
             map.photo(&uri);
             map.corners(points);
             page::figure(caption, &map.svg(caption))
@@ -33,16 +34,36 @@ pub(super) fn with_corners(photos: &Photos, name: &str, caption: &str, points: &
     }
 }
 
-/// A small copy of an image as a data URI, and the size of the original.
-fn embedded(file: &Path) -> crate::Result<(String, [u32; 2])> {
+/// A small copy of the part of an image around the corners, as a data URI, and the part.
+fn embedded(file: &Path, points: &[PointFit]) -> crate::Result<(String, ImagePart)> {
     let in_file = || format!("cannot read {}", file.display());
     let reader = image::ImageReader::open(file).with_context(in_file)?.with_guessed_format().with_context(in_file)?;
     let picture = reader.decode().with_context(in_file)?;
-    let size_px = [picture.width(), picture.height()];
-    let [width, height] = fit_size(size_px, MAX_SIDE_PX);
+    let part = around(points, [picture.width(), picture.height()]);
+    let ImagePart { first_px: [x, y], size_px: [width, height] } = part;
+    let picture = picture.crop_imm(x, y, width, height);
+    let small_px = fit_size(part.size_px, MAX_SIDE_PX);
+    let [width, height] = small_px;
     let small =
-        if [width, height] == size_px { picture } else { picture.resize_exact(width, height, FilterType::Triangle) };
-    Ok((data_uri(&small.into_rgb8(), [width, height], QUALITY)?, size_px))
+        if small_px == part.size_px { picture } else { picture.resize_exact(width, height, FilterType::Triangle) };
+    Ok((data_uri(&small.into_rgb8(), small_px, QUALITY)?, part))
+}
+
+/// The part of an image that contains all corners and a margin.
+fn around(points: &[PointFit], size_px: [u32; 2]) -> ImagePart {
+    const MARGIN_FRAC: f64 = 0.2;
+    let range = |axis: usize| {
+        let pixels = || points.iter().map(|point| point.pixel[axis]);
+        let (low, high) = (pixels().fold(f64::INFINITY, f64::min), pixels().fold(f64::NEG_INFINITY, f64::max));
+        let (margin, size) = (MARGIN_FRAC * (high - low), f64::from(size_px[axis]));
+        let [low, high] = [(low - margin).floor(), (high + margin).ceil()].map(|at| at.clamp(0.0, size));
+        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "inside the image")]
+        (high > low + 1.0).then_some((low as u32, (high - low) as u32))
+    };
+    match (range(0), range(1)) {
+        (Some((x, width)), Some((y, height))) => ImagePart { first_px: [x, y], size_px: [width, height] },
+        _ => ImagePart { first_px: [0, 0], size_px },
+    }
 }
 
 /// Indices of the largest and the median value; fewer if there are fewer values.
@@ -70,5 +91,13 @@ mod tests {
         let photos = Photos::from([("a.png".to_owned(), PathBuf::from("does-not-exist.png"))]);
         assert_eq!(with_corners(&photos, "a.png", "a", &[]), "");
         assert_eq!(with_corners(&photos, "b.png", "b", &[]), "");
+    }
+
+    #[test]
+    fn photos_are_cropped_to_the_target() {
+        let point = |x: f64, y: f64| PointFit { pixel: [x, y], residual_px: [0.0; 2] };
+        let part = around(&[point(100.0, 50.0), point(200.0, 90.0)], [640, 96]);
+        assert_eq!((part.first_px, part.size_px), ([80, 42], [140, 54]), "the margin ends at the border");
+        assert_eq!(around(&[], [640, 480]).size_px, [640, 480]);
     }
 }

@@ -37,7 +37,7 @@ impl TimeOffsetReport<'_> {
         if let Some(profile) = self.profile {
             let legend = "Correlation of the rotation rates at each offset. One high, narrow peak determines the offset; several peaks of equal height mean that the motion repeats.";
             page.section("Correlation", legend, &correlation(profile, self.offset));
-            let legend = "The rotation rate of rigidly joined bodies is the same, so the curves must coincide after the correction.";
+            let legend = "The rotation rate of rigidly joined bodies is the same, so the curves must coincide after the correction. Shown are the 15 seconds with the most motion.";
             page.section("Rotation rates", legend, &self.rates(profile));
         }
         if let Some(offset) = self.offset {
@@ -47,22 +47,47 @@ impl TimeOffsetReport<'_> {
         page.finish()
     }
 
+    /// The rates in the part of the recording with the most motion.
     fn rates(&self, profile: &MotionProfile) -> String {
         let [a, b] = &profile.rates;
         let (Some(start_a), Some(start_b)) = (a.first(), b.first()) else { return String::new() };
-        let degrees = |curve: &[[f64; 2]], secs: &dyn Fn(f64) -> f64| -> Vec<[f64; 2]> {
-            curve.iter().map(|[at, rate]| [secs(*at), rate.to_degrees()]).collect()
+        let shown = liveliest(a);
+        let part = |curve: &[[f64; 2]], secs_a: &dyn Fn(f64) -> f64| -> Vec<[f64; 2]> {
+            let moved = curve.iter().map(|[secs, rate]| [secs_a(*secs), rate.to_degrees()]);
+            moved.filter(|[secs, _]| shown.contains(secs)).map(|[secs, rate]| [secs - start_a[0], rate]).collect()
         };
-        let before = rates_chart(
-            "Before, each stream from its first stamp",
-            [degrees(a, &|secs| secs - start_a[0]), degrees(b, &|secs| secs - start_b[0])],
-        );
+        let from_first = |secs: f64| secs - start_b[0] + start_a[0];
+        let rates_a = part(a, &|secs| secs);
+        let before =
+            rates_chart("Before: both streams from their first stamps", [rates_a.clone(), part(b, &from_first)]);
         let Some(offset) = self.offset else { return before };
         let drift = offset.drift_ppm.map_or(0.0, |[drift, _]| 1e-6 * drift);
-        let on_a = |secs: f64| secs + offset.offset_secs + drift * (secs - offset.mid_secs) - start_a[0];
-        let aligned = [degrees(a, &|secs| secs - start_a[0]), degrees(b, &on_a)];
-        before + &rates_chart("After the correction, on the clock of A", aligned)
+        let on_a = |secs: f64| secs + offset.offset_secs + drift * (secs - offset.mid_secs);
+        before + &rates_chart("After: both streams on the clock of A", [rates_a, part(b, &on_a)])
     }
+}
+
+/// The interval of a curve in which its values vary most.
+fn liveliest(curve: &[[f64; 2]]) -> std::ops::RangeInclusive<f64> {
+    const SHOWN_SECS: f64 = 15.0;
+    let variation = |first: f64| {
+        let values =
+            || curve.iter().filter(|[secs, _]| (first..=first + SHOWN_SECS).contains(secs)).map(|[_, value]| *value);
+        let n = values().count().max(1) as f64;
+        let mean = values().sum::<f64>() / n;
+        values().map(|value| (value - mean).powi(2)).sum::<f64>()
+    };
+    let (Some([first, _]), Some([last, _])) = (curve.first(), curve.last()) else { return 0.0..=0.0 };
+    let mut best = (0.0, *first);
+    let mut at = *first;
+    while at < (last - SHOWN_SECS).max(first + 0.5 * SHOWN_SECS) {
+        let found = variation(at);
+        if found > best.0 {
+            best = (found, at);
+        }
+        at += 0.5 * SHOWN_SECS;
+    }
+    best.1..=best.1 + SHOWN_SECS
 }
 
 fn figures(offset: &TimeOffset) -> Vec<page::Figure> {
@@ -188,5 +213,8 @@ mod tests {
         assert!(reduced.len() <= MAX_POINTS && reduced.contains(&[6789.0, 0.9]), "{}", reduced.len());
         assert!(reduced.is_sorted_by(|a, b| a[0] <= b[0]));
         assert_eq!(with_peaks(&curve[..5]), curve[..5]);
+        let motion: Vec<[f64; 2]> =
+            (0..1000).map(|ix| [0.1 * f64::from(ix), if ix == 605 { 1.0 } else { 0.0 }]).collect();
+        assert!(liveliest(&motion).contains(&60.5) && !liveliest(&motion).contains(&30.0));
     }
 }

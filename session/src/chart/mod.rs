@@ -243,7 +243,7 @@ fn draw_legend(legend: &[Entry], plot: &Plot, shapes: &mut Vec<VectorShape>) {
     }
 }
 
-/// Lines with more points have no dots, which would hide the line.
+/// Lines with more points are thinner and have no dots, which would hide the line.
 const MAX_DOTS: usize = 100;
 const PEER_DASH: [f64; 2] = [6.0, 3.0];
 
@@ -264,7 +264,8 @@ fn draw_line(line: &Line, ix: usize, plot: &Plot, shapes: &mut Vec<VectorShape>)
     let points: Vec<[f64; 2]> = line.points.iter().map(|point| plot.at(point)).collect();
     let dash = line.is_peer.then_some(PEER_DASH);
     if points.len() > 1 {
-        shapes.push(VectorShape::Line { points: points.clone(), color: color_of(ix), width: 2.0, dash });
+        let width = if points.len() <= MAX_DOTS { 2.0 } else { 1.4 };
+        shapes.push(VectorShape::Line { points: points.clone(), color: color_of(ix), width, dash });
     }
     if points.len() <= MAX_DOTS {
         points.into_iter().for_each(|at| draw_dot(at, ix, shapes));

@@ -123,7 +123,10 @@ pub(super) fn write_report(file: &Path, html: &str) -> anyhow::Result<()> {
 pub(super) fn heading<T>(input: &Path, result: &anyhow::Result<T>, warnings: Vec<String>) -> Option<Heading> {
     let refused = match result {
         Ok(_) => None,
-        Err(error) if exit::of(error) == Exit::InsufficientData => Some(format!("{error:#}")),
+        Err(error) if exit::of(error) == Exit::InsufficientData => {
+            let text = format!("{error:#}");
+            Some(text.strip_prefix("calibration refused: ").map_or(text.clone(), str::to_owned))
+        }
         Err(_) => return None,
     };
     Some(Heading { input: input.display().to_string(), refused, warnings })

@@ -37,7 +37,8 @@ pub(super) fn detect(target: &TargetSpec, plane: &Plane) -> Result<Detection, No
         _ => Vec::new(),
     };
     if pixels.len() < MIN_CORNERS {
-        return Err(NotDetected::TooFewCorners { found: pixels.len(), min: MIN_CORNERS });
+        let too_few = NotDetected::TooFewCorners { found: pixels.len(), min: MIN_CORNERS };
+        return Err(diagnosis::marker_size(target, &fit.markers).unwrap_or(too_few));
     }
     Ok(target.detection(pixels, fit.layout.is_legacy))
 }
