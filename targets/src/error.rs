@@ -204,7 +204,7 @@ pub enum NotDetected {
     },
     /// The markers are larger or smaller relative to the squares.
     #[error(
-        "the markers are {:.2} times as wide as the squares, expected {:.2}; measure both on the print: if a square has {square}, a marker has {marker}",
+        "the markers are about {:.2} times as wide as the squares, expected {:.2}; measure both on the print: if a square has {square}, a marker has about {marker}",
         found_frac,
         expected_frac
     )]

@@ -4,7 +4,7 @@
 //! Closed-form solutions of sample triples give an initial solution that most samples agree with. It is
 //! refined from board poses by generalized least squares, with noise variances estimated by restricted maximum
 //! likelihood, or from corners by minimizing the reprojection error, with a small unknown error of each robot pose. The
-//! result has an uncertainty and leave-one-out errors. Input that does not determine the result is refused.
+//! result has an uncertainty and the errors of held-out samples. Input that does not determine the result is refused.
 
 mod closed_form;
 mod consensus;
@@ -27,7 +27,7 @@ mod tests;
 
 pub use closed_form::ClosedForm;
 pub(crate) use closed_form::nearest_rotation;
-pub use evaluation::Scatter;
+pub use evaluation::{MAX_FOLDS, Scatter};
 pub use excitation::RotationExcitation;
 pub use next_poses::{NextPose, NextPoseOptions, suggest_next_poses};
 pub use pose_fit::HandEyeNoise;

@@ -256,7 +256,7 @@ fn choose_weights(selection: Selection<'_>, intrinsics: &Intrinsics) -> Result<(
         .map(|((sample, choice), _)| (sample, *choice))
         .collect();
     let held_out_error = |weighting: HandEyeNoise| -> Option<f64> {
-        let folds = evaluation::leave_one_out(input.setup, &measurements, estimated.solution, weighting, true);
+        let folds = evaluation::held_out_solutions(input.setup, &measurements, estimated.solution, weighting, true);
         let folds: Vec<Solution> = folds.into_iter().collect::<Option<_>>()?;
         let squares_px2 = used.iter().zip(&folds).map(|((sample, choice), solution)| {
             let points = corners(input, sample, *choice);

@@ -30,11 +30,12 @@ pub struct HandEyeCalibration {
     pub sigma_deg: [f64; 3],
     /// Scatter of the board over the used samples, with the result of all of them.
     pub scatter: Scatter,
-    /// The same with leave-one-out: each sample is evaluated with a calibration from the others.
+    /// The same for held-out samples: each sample is evaluated with a calibration from others. Leave-one-out, or with more
+    /// than [`MAX_FOLDS`](super::MAX_FOLDS) samples, cross-validation with as many folds.
     pub held_out_scatter: Option<Scatter>,
     /// RMS length of the reprojection error of the used corners, pixels. The robot poses are taken as exact.
     pub rms_px: Option<f64>,
-    /// The same with leave-one-out.
+    /// The same for held-out samples.
     pub held_out_rms_px: Option<f64>,
     /// Estimated measurement errors.
     pub noise: HandEyeNoise,
@@ -151,7 +152,7 @@ impl HeldOut {
         // With corners, the weights were chosen by held-out errors.
         let knows_noise = refined.noise.corner_px.is_some();
         let folds =
-            evaluation::leave_one_out(input.setup, measurements, refined.solution, refined.weighting, knows_noise);
+            evaluation::held_out_solutions(input.setup, measurements, refined.solution, refined.weighting, knows_noise);
         let boards: Option<Vec<Transform>> = folds
             .iter()
             .zip(measurements)

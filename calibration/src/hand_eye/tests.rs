@@ -211,6 +211,18 @@ fn lists_that_are_off_by_one_are_named() {
 }
 
 #[test]
+fn many_samples_are_held_out_in_groups() {
+    const N: usize = 4 * MAX_FOLDS;
+    let scene = Scene::new(Setup::EyeInHand, N, 0.4, 8);
+    let errors = Errors { board_rad: 1e-3, board_m: 5e-4, ..Errors::default() };
+    let calibration = calibrate_hand_eye(&scene.input(scene.poses(&errors, 3))).unwrap();
+    let held_out = calibration.held_out_scatter.unwrap();
+    // One sample in 60 hardly changes the result.
+    assert!((held_out.mm / calibration.scatter.mm - 1.0).abs() < 0.05, "{held_out:?} {:?}", calibration.scatter);
+    assert!(held_out.mm > calibration.scatter.mm, "held-out samples fit worse");
+}
+
+#[test]
 fn wrong_principal_point_is_named_in_the_refusal() {
     let scene = Scene::new(Setup::EyeInHand, 15, 0.4, 2);
     let errors = Errors { corner_px: 0.1, ..Errors::default() };

@@ -7,8 +7,8 @@ use super::photo::{self, Photos};
 use super::scatter::{self, ScatterPoint};
 use super::{Heading, Unused, number, with_sigma};
 use calibration::hand_eye::{
-    BoardObservation, HandEyeCalibration, HandEyeSample, NextPose, RotationExcitation, SampleReport, SampleStatus,
-    Setup,
+    BoardObservation, HandEyeCalibration, HandEyeSample, MAX_FOLDS, NextPose, RotationExcitation, SampleReport,
+    SampleStatus, Setup,
 };
 use kinematics::Transform;
 
@@ -63,6 +63,7 @@ impl HandEyeReport<'_> {
         if let Some(calibration) = self.calibration {
             let legend = "Position of the board according to each sample, relative to the result. A cloud along a line, or two clouds, point to a mistake.";
             page.section("Scatter of the board", legend, &page::gallery(&scatter_plots(calibration)));
+            page.section("Held-out samples", "", &page::note(Some(&held_out(calibration))));
             let legend = "Difference between the measured board and the board that the result predicts. Bars are relative to the largest error of a used sample.";
             let columns = [("position, mm", 2), ("rotation, °", 3), ("corners, px", 3)];
             let rows: Vec<BarRow> = calibration.samples.iter().map(row).collect();
@@ -183,6 +184,26 @@ fn figures(calibration: &HandEyeCalibration) -> Vec<page::Figure> {
         figures.push(("reprojection error", number(Some(rms_px), 3), "px"));
     }
     figures
+}
+
+/// How the held-out errors were obtained.
+fn held_out(calibration: &HandEyeCalibration) -> String {
+    let n_used = calibration.samples.iter().filter(|sample| sample.status == SampleStatus::Used).count();
+    let Some(scatter) = calibration.held_out_scatter else {
+        return "There are too few samples to leave one out.".to_owned();
+    };
+    let method = match n_used > MAX_FOLDS {
+        true => format!(
+            "The samples are divided into {MAX_FOLDS} groups, and each group is evaluated with a calibration from the others"
+        ),
+        false => "Each sample is evaluated with a calibration from the others".to_owned(),
+    };
+    let (mm, deg) = (number(Some(scatter.mm), 2), number(Some(scatter.deg), 3));
+    format!(
+        "{method}: scatter of the board {mm} mm and {deg}°. With all samples: {} mm and {}°.",
+        number(Some(calibration.scatter.mm), 2),
+        number(Some(calibration.scatter.deg), 3)
+    )
 }
 
 fn row(report: &SampleReport) -> BarRow {

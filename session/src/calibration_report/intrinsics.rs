@@ -42,7 +42,8 @@ impl IntrinsicsReport<'_> {
                 calibration.images.len()
             )
         });
-        let mut page = Page::new("Calibration of intrinsics", self.heading, &verdict, &figures);
+        let heading = Heading { input: format!("{} · {}", self.heading.input, self.target), ..self.heading.clone() };
+        let mut page = Page::new("Calibration of intrinsics", &heading, &verdict, &figures);
         if let Some(calibration) = self.calibration {
             page.table("Result", &["parameter", "value ± standard deviation"], parameters(calibration));
             page.section("Line for the rig file", "", &page::code(self.rig_line));
@@ -68,7 +69,6 @@ impl IntrinsicsReport<'_> {
         vec![
             ("images with the target", format!("{} of {n_images}", self.views.len()), ""),
             ("corners", n_corners.to_string(), ""),
-            ("target", self.target.to_owned(), ""),
         ]
     }
 
@@ -77,6 +77,9 @@ impl IntrinsicsReport<'_> {
             Some(calibration) => corners(calibration).map(|point| point.pixel).collect(),
             None => self.views.iter().flat_map(|view| &view.points).map(|point| point.pixel).collect(),
         };
+        if pixels.is_empty() {
+            return Vec::new();
+        }
         let counted = ImageGrid::coverage(self.size_px, pixels.iter().copied());
         let values: Vec<Option<f64>> = counted.values.iter().map(|n| Some(*n as f64)).collect();
         let n_empty = counted.values.iter().filter(|n| **n == 0).count();
@@ -121,6 +124,9 @@ impl IntrinsicsReport<'_> {
     }
 
     fn rows(&self) -> Vec<BarRow> {
+        if self.views.is_empty() {
+            return Vec::new();
+        }
         let row = |view: &BoardView| {
             let images = self.calibration.map_or(&[][..], |calibration| &calibration.images);
             let used = images.iter().find(|image| image.name == view.name);

@@ -54,7 +54,8 @@ impl TimeOffsetReport<'_> {
         let shown = liveliest(a);
         let part = |curve: &[[f64; 2]], secs_a: &dyn Fn(f64) -> f64| -> Vec<[f64; 2]> {
             let moved = curve.iter().map(|[secs, rate]| [secs_a(*secs), rate.to_degrees()]);
-            moved.filter(|[secs, _]| shown.contains(secs)).map(|[secs, rate]| [secs - start_a[0], rate]).collect()
+            let shown = moved.filter(|[secs, _]| shown.contains(secs)).map(|[secs, rate]| [secs - start_a[0], rate]);
+            interrupted(&shown.collect::<Vec<_>>())
         };
         let from_first = |secs: f64| secs - start_b[0] + start_a[0];
         let rates_a = part(a, &|secs| secs);
@@ -177,6 +178,20 @@ fn residual(offset: &TimeOffset) -> String {
     })
 }
 
+/// The curve with a point that is not finite in each gap.
+fn interrupted(curve: &[[f64; 2]]) -> Vec<[f64; 2]> {
+    const GAP: f64 = 2.5; // Relative to the smallest step.
+    let step = curve.windows(2).map(|pair| pair[1][0] - pair[0][0]).fold(f64::INFINITY, f64::min);
+    let mut parts = Vec::with_capacity(curve.len());
+    for (ix, point) in curve.iter().enumerate() {
+        if ix > 0 && point[0] - curve[ix - 1][0] > GAP * step {
+            parts.push([point[0], f64::NAN]);
+        }
+        parts.push(*point);
+    }
+    parts
+}
+
 fn linear(label: &str) -> Axis {
     Axis { label: label.to_owned(), scale: Scale::Linear, ticks: Vec::new() }
 }
@@ -213,6 +228,8 @@ mod tests {
         assert!(reduced.len() <= MAX_POINTS && reduced.contains(&[6789.0, 0.9]), "{}", reduced.len());
         assert!(reduced.is_sorted_by(|a, b| a[0] <= b[0]));
         assert_eq!(with_peaks(&curve[..5]), curve[..5]);
+        let parts = interrupted(&[[0.0, 1.0], [1.0, 2.0], [5.0, 3.0]]);
+        assert!(parts.len() == 4 && parts[2][1].is_nan() && parts[3] == [5.0, 3.0], "{parts:?}");
         let motion: Vec<[f64; 2]> =
             (0..1000).map(|ix| [0.1 * f64::from(ix), if ix == 605 { 1.0 } else { 0.0 }]).collect();
         assert!(liveliest(&motion).contains(&60.5) && !liveliest(&motion).contains(&30.0));

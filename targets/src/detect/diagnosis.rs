@@ -20,7 +20,7 @@ const MIN_BITS_OF_SINGLE: usize = 6;
 /// Each marker measures the distance to its neighbors in units of its side.
 pub(super) fn marker_size(target: &TargetSpec, markers: &[Marker]) -> Option<NotDetected> {
     /// Smaller differences do not prevent detection.
-    const MIN_CHANGE: f64 = 0.06;
+    const MIN_CHANGE: f64 = 0.1;
     const MIN_PAIRS: usize = 4;
     /// Pairs that measure the same size, if the markers are in the right places.
     const MIN_SAME_FRAC: f64 = 0.8;
@@ -42,7 +42,7 @@ pub(super) fn marker_size(target: &TargetSpec, markers: &[Marker]) -> Option<Not
         found_frac,
         expected_frac,
         square: Millimeters(square_m).to_string(),
-        marker: format!("{:.1}mm", 1e3 * found_frac * square_m),
+        marker: format!("{:.0}mm", 1e3 * found_frac * square_m),
     })
 }
 

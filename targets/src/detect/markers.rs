@@ -38,7 +38,7 @@ pub(super) fn detect(target: &TargetSpec, plane: &Plane) -> Result<Detection, No
     };
     if pixels.len() < MIN_CORNERS {
         let too_few = NotDetected::TooFewCorners { found: pixels.len(), min: MIN_CORNERS };
-        return Err(diagnosis::marker_size(target, &fit.markers).unwrap_or(too_few));
+        return Err(diagnosis::marker_size(target, &markers).unwrap_or(too_few));
     }
     Ok(target.detection(pixels, fit.layout.is_legacy))
 }
