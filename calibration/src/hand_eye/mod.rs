@@ -12,6 +12,7 @@ mod corner_fit;
 mod evaluation;
 mod excitation;
 mod geometry;
+mod intrinsics_doubt;
 mod mistakes;
 mod next_poses;
 mod planar_pose;
@@ -22,6 +23,7 @@ mod report;
 mod samples;
 #[cfg(test)]
 pub(crate) mod scene;
+mod selection;
 #[cfg(test)]
 mod tests;
 

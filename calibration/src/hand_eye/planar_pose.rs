@@ -4,6 +4,7 @@
 //! plane-based pose estimation", section 4.3). Both are refined by minimizing the reprojection error.
 
 use super::closed_form::nearest_rotation;
+use crate::intrinsics::board_pose::moved;
 use crate::intrinsics::homography;
 use crate::least_squares::{self, BlockSums, Loss};
 use crate::{BoardPoint, BoardView};
@@ -34,12 +35,6 @@ impl BoardPose {
     pub(super) fn n_inliers(&self) -> usize {
         self.is_inlier.iter().filter(|is_inlier| **is_inlier).count()
     }
-}
-
-/// A pose after a small rotation about the origin of the board, in camera axes, and a translation in camera axes.
-pub(super) fn moved(pose: &Transform, step: &Vector6<f64>) -> Transform {
-    let rotation = UnitQuaternion::from_scaled_axis(step.fixed_rows::<3>(0).into_owned());
-    Transform::from_parts((pose.translation.vector + step.fixed_rows::<3>(3)).into(), rotation * pose.rotation)
 }
 
 /// The poses that explain the corners, best first: one or two. Empty if the corners do not determine a pose. Corners

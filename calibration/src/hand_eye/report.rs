@@ -6,6 +6,7 @@ use super::geometry;
 use super::mistakes;
 use super::pose_fit::{self, HandEyeNoise, Measurement};
 use super::refine::{self, Refined};
+use super::selection;
 use super::{HandEyeInput, Setup};
 use crate::least_squares::sigma_of;
 use crate::{BoardPoint, Error, PointFit};
@@ -175,7 +176,7 @@ fn rms_px(
     let used = refined.samples.iter().zip(&refined.choice).zip(&refined.is_inlier).filter(|(_, is_inlier)| **is_inlier);
     let (mut squares, mut n) = (0.0, 0);
     for (used_ix, ((sample, choice), _)) in used.enumerate() {
-        let points = refine::corners(input, sample, *choice);
+        let points = selection::corners(input, sample, *choice);
         squares +=
             evaluation::reprojection_squares(&refine::predicted(&solution(used_ix)?, sample), &points, intrinsics);
         n += points.len();
@@ -209,7 +210,7 @@ fn sample_reports(input: &HandEyeInput<'_>, refined: &Refined, without_board: &[
         let board = sample.a * refined.solution.x * sample.candidates[refined.choice[ix]].camera_from_board;
         report.board_offset_mm =
             Some(((board.translation.vector - refined.solution.y.translation.vector) * 1e3).into());
-        let points = refine::corners(input, sample, refined.choice[ix]);
+        let points = selection::corners(input, sample, refined.choice[ix]);
         let pose = refine::predicted(&refined.solution, sample);
         report.rms_px = refined.intrinsics.as_ref().filter(|_| !points.is_empty()).map(|intrinsics| {
             (evaluation::reprojection_squares(&pose, &points, intrinsics) / points.len() as f64).sqrt()

@@ -28,10 +28,13 @@ impl SceneReport<'_> {
         let mut verdict = String::new();
         if let Some(calibration) = self.calibration {
             let alignment = &calibration.alignment;
-            let kept = alignment.trials.iter().filter(|trial| trial.kept);
+            let gains_db: Vec<f64> =
+                alignment.trials.iter().filter(|trial| trial.kept).map(|trial| trial.gain_db).collect();
             figures.push(("pairs of images", alignment.n_pairs.to_string(), ""));
             figures.push(("accepted corrections", alignment.estimates.len().to_string(), ""));
-            figures.push(("gain", format!("{:+.2}", kept.map(|trial| trial.gain_db).sum::<f64>()), "dB"));
+            if !gains_db.is_empty() {
+                figures.push(("gain on validation images", format!("{:+.2}", gains_db.iter().sum::<f64>()), "dB"));
+            }
             verdict = match alignment.estimates.is_empty() {
                 true => "Nothing to correct: no parameter improves the prediction of validation images.".to_owned(),
                 false => format!("{} corrections were accepted.", alignment.estimates.len()),
@@ -157,4 +160,41 @@ fn trial(trial: &Trial) -> Vec<String> {
         trial.n_images.to_string(),
         decision.to_owned(),
     ]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use calibration::{Alignment, Candidate, ParamSet};
+    use std::collections::BTreeMap;
+
+    #[test]
+    fn corrections_trials_and_refused_cameras_are_listed() {
+        let estimate = ScalarEstimate { camera: "<wrist>".to_owned(), value: 0.008, sigma: 2e-5 };
+        let alignment = Alignment {
+            estimates: vec![Estimate::TimeOffset(estimate)],
+            trials: vec![Trial::of_gains(Candidate::Cameras(ParamSet::TIME_OFFSET), &[0.4, 0.5, 0.3, 0.45])],
+            ..Alignment::default()
+        };
+        let refused = BTreeMap::from([("side".to_owned(), "it does not turn".to_owned())]);
+        let calibration = SceneCalibration { alignment, rig: None, refused };
+        let heading = Heading { input: "a.mcap".to_owned(), refused: None, warnings: vec!["side is kept".to_owned()] };
+        let n_images = [("<wrist>".to_owned(), 30), ("side".to_owned(), 12)];
+        let with = |calibration| SceneReport { heading: &heading, rig: None, n_images: &n_images, calibration }.html();
+        let page = with(Some(&calibration));
+        for words in [
+            "time offset of &lt;wrist&gt;",
+            "8.000 ± 0.020 ms",
+            "+0.41 ± 0.04",
+            "accepted",
+            "kept: it does not turn",
+            "Accepted, with warnings",
+            "<dd>42</dd>",
+        ] {
+            assert!(page.contains(words), "{words} is missing: {page}");
+        }
+        assert!(!page.contains("<wrist>"));
+        let page = with(None);
+        assert!(page.contains("<td>side</td><td>12</td>") && !page.contains("accepted corrections"), "{page}");
+    }
 }
