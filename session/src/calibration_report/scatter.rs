@@ -25,11 +25,11 @@ pub(super) fn svg(axes: [&str; 2], points: &[ScatterPoint]) -> String {
     for tick in [-2.0, -1.0, 0.0, 1.0, 2.0] {
         let (at, low, high) = (CENTER + REACH * tick / 2.0, CENTER - REACH, CENTER + REACH);
         let label = short(tick * step);
-        write!(
+        writeln!(
             shapes,
             "<path class=\"gridline\" d=\"M{at:.1} {low}V{high}M{low} {at:.1}H{high}\"/>\
              <text x=\"{at:.1}\" y=\"{:.1}\" text-anchor=\"middle\">{label}</text>\
-             <text x=\"{:.1}\" y=\"{:.1}\" text-anchor=\"end\" dominant-baseline=\"central\">{}</text>\n",
+             <text x=\"{:.1}\" y=\"{:.1}\" text-anchor=\"end\" dominant-baseline=\"central\">{}</text>",
             high + 16.0,
             low - 5.0,
             at,
@@ -39,9 +39,9 @@ pub(super) fn svg(axes: [&str; 2], points: &[ScatterPoint]) -> String {
     }
     for ScatterPoint { name, at: [x, y], is_outlier } in points {
         let class = if *is_outlier { "point outlier" } else { "point" };
-        write!(
+        writeln!(
             shapes,
-            "<circle class=\"{class}\" cx=\"{:.1}\" cy=\"{:.1}\" r=\"4\"><title>{}: {x:.2}, {y:.2}</title></circle>\n",
+            "<circle class=\"{class}\" cx=\"{:.1}\" cy=\"{:.1}\" r=\"4\"><title>{}: {x:.2}, {y:.2}</title></circle>",
             CENTER + to(*x),
             CENTER - to(*y),
             escaped(name)
