@@ -27,7 +27,9 @@ pub(super) fn correlate(a: &Stream, b: &Stream, max_offset_secs: Option<f64>) ->
     const MAX_OTHERS: usize = 4;
     for (name, stream) in [("A", a), ("B", b)] {
         let own = Grid::new(stream, stream);
-        if let (Some(refusal), Err(_)) = (stamps::unit_mistake(name, stream), own.rates[0].check_excitation(name)) {
+        if let (Some(refusal), Err(_)) =
+            (stamps::unit_mistake(name, stream.median_step_secs()), own.rates[0].check_excitation(name))
+        {
             return Err(refusal);
         }
     }

@@ -1,7 +1,6 @@
 //! Names mistakes in the stamps of a stream: wrong units, rounded stamps, several bodies in one file.
 
 use super::PoseSample;
-use super::stream::Stream;
 use crate::hand_eye::Refusal;
 
 /// Units in which stamps are often given by mistake, and how many make a second.
@@ -11,8 +10,9 @@ const USUAL_STEPS_SECS: std::ops::RangeInclusive<f64> = 0.0004..=0.4;
 
 /// The unit of stamps that are not seconds. Real steps of several seconds look like milliseconds, so this explains only
 /// streams that are of no use otherwise.
-pub(super) fn unit_mistake(name: &str, stream: &Stream) -> Option<Refusal> {
-    let step_secs = stream.median_step_secs();
+///
+/// * `step_secs`: typical difference of consecutive stamps.
+pub(super) fn unit_mistake(name: &str, step_secs: f64) -> Option<Refusal> {
     if USUAL_STEPS_SECS.contains(&step_secs) {
         return None;
     }

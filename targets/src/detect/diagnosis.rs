@@ -15,12 +15,15 @@ const MIN_MARKERS: usize = 3;
 /// Cells per side from which a single marker without an error is no chance.
 const MIN_BITS_OF_SINGLE: usize = 6;
 
+/// Difference of the size of markers that may prevent the detection of corners.
+pub(super) const MIN_SIZE_CHANGE: f64 = 0.1;
+
 /// The size of ChArUco markers relative to the squares, if it is not that of the target.
 ///
 /// Each marker measures the distance to its neighbors in units of its side.
-pub(super) fn marker_size(target: &TargetSpec, markers: &[Marker]) -> Option<NotDetected> {
-    /// Smaller differences do not prevent detection.
-    const MIN_CHANGE: f64 = 0.1;
+///
+/// * `min_change`: smaller relative differences are ignored. Blur makes small markers look up to 10 % smaller.
+pub(super) fn marker_size(target: &TargetSpec, markers: &[Marker], min_change: f64) -> Option<NotDetected> {
     const MIN_PAIRS: usize = 4;
     /// Pairs that measure the same size, if the markers are in the right places.
     const MIN_SAME_FRAC: f64 = 0.8;
@@ -38,7 +41,7 @@ pub(super) fn marker_size(target: &TargetSpec, markers: &[Marker]) -> Option<Not
     };
     let found_frac = layouts(&target.pattern).iter().find_map(measured)?;
     let is_possible = found_frac > 0.0 && found_frac < 1.0;
-    (is_possible && (found_frac / expected_frac - 1.0).abs() > MIN_CHANGE).then(|| NotDetected::MarkerSize {
+    (is_possible && (found_frac / expected_frac - 1.0).abs() > min_change).then(|| NotDetected::MarkerSize {
         found_frac,
         expected_frac,
         square: Millimeters(square_m).to_string(),
@@ -94,7 +97,7 @@ pub(super) fn markers(
         return if 2 * n_expected < found.0.len() {
             NotDetected::OtherIds { found, expected: Ids(expected.collect()) }
         } else {
-            marker_size(target, markers).unwrap_or(NotDetected::OtherArrangement { found })
+            marker_size(target, markers, MIN_SIZE_CHANGE).unwrap_or(NotDetected::OtherArrangement { found })
         };
     }
     // Number of markers, without those that may be chance.
