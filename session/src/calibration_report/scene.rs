@@ -45,10 +45,10 @@ impl SceneReport<'_> {
             let alignment = &calibration.alignment;
             let corrections: Vec<Vec<String>> = alignment.estimates.iter().flat_map(|of| self.rows(of)).collect();
             page.table("Corrections", &["parameter", "value ± standard deviation", "direction"], corrections);
-            let head = ["tested parameters", "gain on validation images, dB", "images", "decision"];
+            let head = ["tested parameters", "gain on validation images, dB", "by camera, dB", "images", "decision"];
             page.table("Trials", &head, alignment.trials.iter().map(trial).collect());
         }
-        page.table("Cameras", &["camera", "images", "extrinsics"], self.cameras());
+        page.table("Cameras", &["camera", "images", "accepted gain, dB", "extrinsics"], self.cameras());
         if let Some(calibration) = self.calibration {
             let unobservable = calibration.alignment.unobservable.iter().map(|direction| vec![direction.to_string()]);
             page.table("Directions that the motion does not determine", &["combination"], unobservable.collect());
@@ -73,7 +73,14 @@ impl SceneReport<'_> {
                 (None, Some(_)) => "not changed".to_owned(),
                 (None, None) => "–".to_owned(),
             };
-            vec![name.clone(), n_images.to_string(), state]
+            let kept = self.calibration.iter().flat_map(|calibration| &calibration.alignment.trials);
+            let gains_db: Vec<f64> = kept
+                .filter(|trial| trial.kept)
+                .filter_map(|trial| trial.gain_by_camera_db.get(name).copied())
+                .collect();
+            let gain =
+                if gains_db.is_empty() { "–".to_owned() } else { format!("{:+.2}", gains_db.iter().sum::<f64>()) };
+            vec![name.clone(), n_images.to_string(), gain, state]
         };
         self.n_images.iter().map(row).collect()
     }
@@ -154,9 +161,11 @@ fn scalar(what: &str, estimate: &ScalarEstimate, factor: f64, unit: &str, digits
 
 fn trial(trial: &Trial) -> Vec<String> {
     let decision = if trial.kept { "accepted" } else { "not significant" };
+    let by_camera = trial.gain_by_camera_db.iter().map(|(camera, gain_db)| format!("{camera} {gain_db:+.2}"));
     vec![
         trial.candidate.to_string(),
         format!("{:+.2} ± {:.2}", trial.gain_db, trial.standard_error_db),
+        by_camera.collect::<Vec<_>>().join(", "),
         trial.n_images.to_string(),
         decision.to_owned(),
     ]
@@ -173,7 +182,10 @@ mod tests {
         let estimate = ScalarEstimate { camera: "<wrist>".to_owned(), value: 0.008, sigma: 2e-5 };
         let alignment = Alignment {
             estimates: vec![Estimate::TimeOffset(estimate)],
-            trials: vec![Trial::of_gains(Candidate::Cameras(ParamSet::TIME_OFFSET), &[0.4, 0.5, 0.3, 0.45])],
+            trials: vec![
+                Trial::of_gains(Candidate::Cameras(ParamSet::TIME_OFFSET), &[0.4, 0.5, 0.3, 0.45])
+                    .with_cameras([("side", 0.4), ("side", 0.6)].into_iter()),
+            ],
             ..Alignment::default()
         };
         let refused = BTreeMap::from([("side".to_owned(), "it does not turn".to_owned())]);
@@ -186,6 +198,7 @@ mod tests {
             "time offset of &lt;wrist&gt;",
             "8.000 ± 0.020 ms",
             "+0.41 ± 0.04",
+            "<td>+0.50</td>",
             "accepted",
             "kept: it does not turn",
             "Accepted, with warnings",
@@ -195,6 +208,9 @@ mod tests {
         }
         assert!(!page.contains("<wrist>"));
         let page = with(None);
-        assert!(page.contains("<td>side</td><td>12</td>") && !page.contains("accepted corrections"), "{page}");
+        assert!(
+            page.contains("<td>side</td><td>12</td><td>–</td>") && !page.contains("accepted corrections"),
+            "{page}"
+        );
     }
 }
