@@ -35,6 +35,7 @@ mod noise;
 mod objects;
 mod optics;
 mod panda;
+mod printed_target;
 mod random;
 mod render;
 mod rig;
@@ -57,6 +58,7 @@ pub mod layout {
 
 pub use config::{
     BaseConfig, CameraConfig, Config, DepthConfig, DepthSensor, Parent, ScannerConfig, Scene, SensorConfig, StampConfig,
+    TargetConfig,
 };
 pub use error::Error;
 pub use live::{LiveRig, LiveTruth};
