@@ -22,6 +22,8 @@ mod report;
 mod samples;
 #[cfg(test)]
 pub(crate) mod scene;
+mod shutter;
+
 #[cfg(test)]
 mod tests;
 
@@ -32,6 +34,7 @@ pub use next_poses::{NextPose, NextPoseOptions, suggest_next_poses};
 pub use pose_fit::HandEyeNoise;
 pub use refusal::Refusal;
 pub use report::{HandEyeCalibration, JointOffset, SampleReport, SampleStatus};
+pub use shutter::{FlangeMotion, corners_at_mid_exposure};
 
 use crate::{BoardView, Error};
 use kinematics::{Chain, Intrinsics, Transform, transform};

@@ -1,6 +1,7 @@
 //! `fieldrig calibrate hand-eye`: the pose of a camera on a robot, from images of a target or poses of a board.
 
 use super::lens::LensFile;
+use super::scan::{Scan, ScanFlags};
 use super::{images, matrix_of, print_matrix, target_argument, transform_of};
 use crate::exit::{self, BadArgument, Exit, InsufficientData};
 use crate::print;
@@ -25,19 +26,28 @@ const SAMPLES_HELP: &str = r#"Samples as JSON:
 
 Instead of an image, a sample may contain the pose of the board, "camera_from_board"; then intrinsics and target are not
 needed. With the setup "eye-to-hand", the camera is fixed and the board moves with the flange. Lengths in meters, matrices
-row by row, pixel centers at +0.5, image files relative to this file."#;
+row by row, pixel centers at +0.5, image files relative to this file.
+
+From a recording or the devices of a rig file, images are used in which the arm is slow and the target visible."#;
+
+const INPUT_HELP: &str = "Samples as JSON, a recording (.mcap), or a rig file (.toml) whose devices are read";
 
 /// Flags of `calibrate hand-eye`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    #[arg(value_name = "SAMPLES.json", help = "Samples as JSON", long_help = SAMPLES_HELP)]
+    #[arg(value_name = "SAMPLES.json|RECORDING|RIG", help = INPUT_HELP, long_help = SAMPLES_HELP)]
     samples: PathBuf,
+    /// With a recording or rig file: the target, such as charuco:5x7:34mm:26mm:5X5_100
+    #[arg(long, value_name = "SPEC", value_parser = target_argument)]
+    target: Option<TargetSpec>,
+    #[command(flatten)]
+    scan: ScanFlags,
     /// Also estimate the intrinsics, starting from those in the file; needs images
     #[arg(long)]
     with_intrinsics: bool,
-    /// Also estimate the offsets of all joints except the first and the last; needs images, "joints" in the samples,
-    /// --urdf and --tip
-    #[arg(long, requires_all = ["urdf", "tip"])]
+    /// Also estimate the offsets of all joints except the first and the last. With samples in JSON: needs images,
+    /// "joints" in the samples, --urdf and --tip
+    #[arg(long)]
     with_joints: bool,
     /// Robot description of the arm
     #[arg(long, value_name = "FILE.urdf", requires = "tip")]
@@ -138,17 +148,22 @@ struct PrintedSample {
 
 /// Calibrates and prints the result. Exit code 4 if the samples do not determine it.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
-    let file = SamplesFile::read(&args.samples)?;
+    let scan = args.scan.read(&args.samples, args.target.as_ref(), args.json)?;
+    let file = match (&scan, &args.target) {
+        (Some(scan), target) => SamplesFile::of_scan(scan, target.as_ref()),
+        (None, Some(_)) => return Err(BadArgument("--target: samples contain their target".into()).into()),
+        (None, None) => SamplesFile::read(&args.samples)?,
+    };
     let setup = file.setup()?;
     let mut unused = Vec::new();
-    let result = args.calibrate(&file, setup, &mut unused);
+    let result = args.calibrate(&file, scan.as_ref(), setup, &mut unused);
     let printed = match result {
         Ok(printed) => printed,
         Err(error) if exit::of(&error) == Exit::InsufficientData => {
             let mut reason = format!("{error:#}");
             if let Some(first) = unused.first() {
                 let first_reason = first.reason.as_deref().unwrap_or_default();
-                let (n, n_all) = (unused.len(), file.samples.len());
+                let (n, n_all) = (unused.len(), scan.as_ref().map_or(file.samples.len(), Scan::n_images));
                 reason =
                     format!("{reason}; {n} of {n_all} images do not show the target: {}: {first_reason}", first.name);
             }
@@ -171,28 +186,43 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
 
 impl Args {
     /// Samples whose image does not show the target are added to `unused`.
-    fn calibrate(&self, file: &SamplesFile, setup: Setup, unused: &mut Vec<PrintedSample>) -> anyhow::Result<Printed> {
+    fn calibrate(
+        &self,
+        file: &SamplesFile,
+        scan: Option<&Scan>,
+        setup: Setup,
+        unused: &mut Vec<PrintedSample>,
+    ) -> anyhow::Result<Printed> {
         let target = file.target.as_deref().map(target_argument).transpose().map_err(BadArgument)?;
-        let samples = file.samples(&self.samples, target.as_ref(), self.json, unused)?;
+        let samples = match scan {
+            Some(scan) => Samples::of_scan(scan, unused),
+            None => file.samples(&self.samples, target.as_ref(), self.json, unused)?,
+        };
         let symmetries = target.as_ref().map(TargetSpec::symmetry).unwrap_or_default();
         let chain = self.chain()?;
-        let intrinsics = match (&file.intrinsics, samples.size_px) {
-            (Some(lens), Some(size_px)) => Some(lens.intrinsics(size_px)?),
+        let intrinsics = match (scan, &file.intrinsics, samples.size_px) {
+            (Some(scan), ..) => Some(scan.intrinsics().clone()),
+            (None, Some(lens), Some(size_px)) => Some(lens.intrinsics(size_px)?),
             _ => None,
         };
-        let input = HandEyeInput {
+        let mut input = HandEyeInput {
             setup,
             samples: samples.used,
             intrinsics,
             board_symmetries: &symmetries,
-            chain: chain.as_ref(),
+            chain: chain.as_ref().or(scan.and_then(Scan::chain)),
             options: HandEyeOptions {
                 estimate_intrinsics: self.with_intrinsics,
                 estimate_joint_offsets: self.with_joints,
                 ..HandEyeOptions::default()
             },
         };
-        let calibration = calibrate_hand_eye(&input)?;
+        let mut calibration = calibrate_hand_eye(&input)?;
+        if let Some(scan) = scan {
+            // The correction for a rolling shutter depends on the pose of the camera.
+            input.samples = scan.samples(Some(&calibration.parent_from_camera)).0;
+            calibration = calibrate_hand_eye(&input)?;
+        }
         let mut printed = printed(&calibration);
         if let Some(target) = &target {
             let next_poses = suggest_next_poses(&input, &calibration, &next_pose_options(target));
@@ -237,7 +267,34 @@ struct Samples {
     size_px: Option<[u32; 2]>,
 }
 
+impl Samples {
+    fn of_scan(scan: &Scan, unused: &mut Vec<PrintedSample>) -> Self {
+        let (used, without_target) = scan.samples(None);
+        unused.extend(without_target.into_iter().map(|(name, reason)| PrintedSample {
+            name,
+            status: "no-board",
+            reason: Some(reason),
+            ..PrintedSample::default()
+        }));
+        Self { used, size_px: Some(scan.intrinsics().size_px) }
+    }
+}
+
 impl SamplesFile {
+    /// The settings of a scan, without samples.
+    fn of_scan(scan: &Scan, target: Option<&TargetSpec>) -> Self {
+        let setup = match scan.setup() {
+            Setup::EyeInHand => "eye-in-hand",
+            Setup::EyeToHand => "eye-to-hand",
+        };
+        Self {
+            intrinsics: None,
+            target: target.map(TargetSpec::to_string),
+            setup: Some(setup.to_owned()),
+            samples: Vec::new(),
+        }
+    }
+
     fn read(path: &Path) -> anyhow::Result<Self> {
         let text = std::fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))?;
         let invalid = |error: serde_json::Error| BadArgument(format!("{}: {error}", path.display()));

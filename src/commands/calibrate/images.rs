@@ -9,7 +9,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use targets::{Detection, GrayImage, TargetSpec};
 
 /// The target in one image.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub(super) struct DetectedImage {
     /// Name of the file.
     pub(super) name: String,
@@ -18,7 +18,7 @@ pub(super) struct DetectedImage {
 }
 
 /// The target in an image of known size.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub(super) struct Board {
     pub(super) size_px: [u32; 2],
     pub(super) view: BoardView,
@@ -52,20 +52,31 @@ pub(super) fn files(folder: &Path) -> anyhow::Result<Vec<PathBuf>> {
 /// Detects a target in image files, on all processors; the results are in the order of the files. `is_hidden`: no
 /// progress bar.
 pub(super) fn detect(files: &[PathBuf], target: &TargetSpec, is_hidden: bool) -> Vec<DetectedImage> {
-    let bar = print::bar(Some(files.len() as u64), "{bar:30} {pos} of {len} images", is_hidden);
+    detect_each(files, is_hidden, |path| {
+        let name = path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned();
+        let board = detect_in(path, &name, target).map_err(|error| format!("{error:#}"));
+        DetectedImage { name, board }
+    })
+}
+
+/// Calls a function for each image, on all processors; the results are in the order of the images.
+pub(super) fn detect_each<T: Sync>(
+    images: &[T],
+    is_hidden: bool,
+    detect: impl Fn(&T) -> DetectedImage + Sync,
+) -> Vec<DetectedImage> {
+    let bar = print::bar(Some(images.len() as u64), "{bar:30} {pos} of {len} images", is_hidden);
     let next = AtomicUsize::new(0);
     let detect_some = || {
         let mut detected = Vec::new();
         loop {
             let ix = next.fetch_add(1, Ordering::Relaxed);
-            let Some(path) = files.get(ix) else { return detected };
-            let name = path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned();
-            let board = detect_in(path, &name, target).map_err(|error| format!("{error:#}"));
-            detected.push((ix, DetectedImage { name, board }));
+            let Some(image) = images.get(ix) else { return detected };
+            detected.push((ix, detect(image)));
             bar.inc(1);
         }
     };
-    let n_threads = std::thread::available_parallelism().map_or(1, |n| n.get().min(files.len()));
+    let n_threads = std::thread::available_parallelism().map_or(1, |n| n.get().min(images.len()));
     let mut detected: Vec<_> = std::thread::scope(|scope| {
         let threads: Vec<_> = (0..n_threads).map(|_| scope.spawn(detect_some)).collect();
         threads.into_iter().flat_map(|thread| thread.join().expect("detection does not panic")).collect()
@@ -79,8 +90,11 @@ fn detect_in(path: &Path, name: &str, target: &TargetSpec) -> anyhow::Result<Boa
     let read = || anyhow::Ok(image::ImageReader::open(path)?.with_guessed_format()?.decode()?.into_luma8());
     let gray = read().context("cannot read the image")?;
     let size_px = [gray.width(), gray.height()];
-    let detection = target.detect(GrayImage { size_px, pixels: gray.as_raw() })?;
-    Ok(Board { size_px, view: view(name, &detection) })
+    detect_in_gray(GrayImage { size_px, pixels: gray.as_raw() }, name, target)
+}
+
+pub(super) fn detect_in_gray(gray: GrayImage<'_>, name: &str, target: &TargetSpec) -> anyhow::Result<Board> {
+    Ok(Board { size_px: gray.size_px, view: view(name, &target.detect(gray)?) })
 }
 
 fn view(name: &str, detection: &Detection) -> BoardView {

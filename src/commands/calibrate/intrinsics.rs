@@ -2,6 +2,7 @@
 
 use super::images::{self, DetectedImage};
 use super::lens::LensFile;
+use super::scan::ScanFlags;
 use super::target_argument;
 use crate::exit::{Exit, InsufficientData};
 use crate::print;
@@ -19,9 +20,12 @@ const TARGET_HELP: &str =
 /// Flags of `calibrate intrinsics`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// Folder of images (.jpg, .png) of the target, all of one camera and one size
-    #[arg(value_name = "IMAGES")]
+    /// Folder of images (.jpg, .png) of the target, all of one camera and one size; or a recording (.mcap) or rig file
+    /// (.toml) whose camera sees the target
+    #[arg(value_name = "IMAGES|RECORDING|RIG")]
     folder: PathBuf,
+    #[command(flatten)]
+    scan: ScanFlags,
     #[arg(long, value_name = "SPEC", value_parser = target_argument, help = TARGET_HELP)]
     target: TargetSpec,
     /// Lens model
@@ -101,7 +105,10 @@ struct PrintedTrial<'a> {
 
 /// Detects the target, calibrates, and prints the result.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
-    let detected = images::detect(&images::files(&args.folder)?, &args.target, args.json);
+    let detected = match args.scan.read(&args.folder, Some(&args.target), args.json)? {
+        Some(scan) => scan.detected(),
+        None => images::detect(&images::files(&args.folder)?, &args.target, args.json),
+    };
     let (mut views, mut sizes_px, mut rejected) = (Vec::<BoardView>::new(), Vec::new(), Vec::new());
     for DetectedImage { name, board } in detected {
         match board {

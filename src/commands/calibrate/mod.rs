@@ -4,6 +4,7 @@ mod hand_eye;
 mod images;
 mod intrinsics;
 mod lens;
+mod scan;
 mod scene;
 mod target;
 mod time_offset;
