@@ -4,8 +4,8 @@ use super::{matrix_of, print_matrix};
 use crate::console::ReadBar;
 use crate::exit::{self, BadArgument, Exit, InsufficientData};
 use crate::{print, signals};
-use calibration::{CameraCorrection, Estimate, Trial, rigid_transform};
-use capture::config::{Override, Rig};
+use calibration::{CameraCorrection, Estimate, ExtrinsicsCovariance, PoseSigmas, Trial, rigid_transform};
+use capture::config::{Camera, Override, Rig};
 use capture::open::{self, Devices};
 use drivers::Sample;
 use keyframe::listed;
@@ -73,10 +73,25 @@ struct PrintedCamera {
     /// Why its extrinsics are those of the rig file.
     refused: Option<String>,
     parent_from_camera: [[f64; 4]; 4],
+    /// Standard deviations along and about the axes of the camera; null if its extrinsics were not estimated.
+    sigma_mm: Option<[f64; 3]>,
+    sigma_deg: Option<[f64; 3]>,
+    /// Pose in the frame of the first camera with the same parent; null for that camera.
+    relative: Option<PrintedRelative>,
     focal_px: [f64; 2],
     principal_px: [f64; 2],
     /// Time from the stamps of the images to mid-exposure, milliseconds.
     stamp_to_mid_exposure_millis: Option<f64>,
+}
+
+/// Pose of a camera in the frame of another one.
+#[derive(Debug, Serialize)]
+struct PrintedRelative {
+    camera: String,
+    camera_from_this: [[f64; 4]; 4],
+    /// Standard deviations along and about the axes of this camera; null if they are unknown.
+    sigma_mm: Option<[f64; 3]>,
+    sigma_deg: Option<[f64; 3]>,
 }
 
 /// Calibrates and prints the estimates. Exit code 4 if the data do not determine the extrinsics of any camera.
@@ -173,16 +188,28 @@ impl Args {
     }
 }
 
-fn is_rig_file(path: &Path) -> bool {
+/// Whether a path is that of a rig file.
+pub(super) fn is_rig_file(path: &Path) -> bool {
     path.extension().is_some_and(|extension| extension == "toml")
 }
 
 fn printed<'a>(data: &Data, calibration: &'a SceneCalibration, is_refused: bool) -> Printed<'a> {
-    let cameras = calibration.rig.iter().flat_map(|rig| &rig.cameras).map(|camera| {
+    let covariance = calibration.alignment.extrinsics_covariance.as_ref();
+    let all: Vec<&Camera> = calibration.rig.iter().flat_map(|rig| &rig.cameras).collect();
+    let cameras = all.iter().map(|camera| {
+        let is_refused = |camera: &Camera| calibration.refused.contains_key(&*camera.name);
+        let sigmas =
+            covariance.filter(|_| !is_refused(camera)).and_then(|covariance| covariance.of_camera(&camera.name));
+        let first = all.iter().find(|first| first.parent == camera.parent && first.name != camera.name);
+        let first = first.filter(|first| first.name < camera.name);
         let printed = PrintedCamera {
             n_images: data.keyframes.iter().filter(|keyframe| *keyframe.camera == *camera.name).count(),
             refused: calibration.refused.get(&*camera.name).cloned(),
             parent_from_camera: matrix_of(&camera.parent_from_camera),
+            sigma_mm: sigmas.map(sigma_mm),
+            sigma_deg: sigmas.map(sigma_deg),
+            relative: first
+                .map(|first| relative(first, camera, covariance.filter(|_| !is_refused(camera) && !is_refused(first)))),
             focal_px: camera.intrinsics.focal_px,
             principal_px: camera.intrinsics.principal_px,
             stamp_to_mid_exposure_millis: camera.stamp_to_mid_exposure.as_ref().map(|offset| offset.value_millis),
@@ -203,6 +230,26 @@ fn printed<'a>(data: &Data, calibration: &'a SceneCalibration, is_refused: bool)
         unobservable: alignment.unobservable.iter().map(ToString::to_string).collect(),
         refused: is_refused.then(|| reasons.collect::<Vec<_>>().join("; ")),
     }
+}
+
+fn relative(first: &Camera, camera: &Camera, covariance: Option<&ExtrinsicsCovariance>) -> PrintedRelative {
+    let first_from_camera = first.parent_from_camera.inverse() * camera.parent_from_camera;
+    let between = |covariance: &ExtrinsicsCovariance| covariance.between(&first.name, &camera.name, &first_from_camera);
+    let sigmas = covariance.and_then(between);
+    PrintedRelative {
+        camera: first.name.to_string(),
+        camera_from_this: matrix_of(&first_from_camera),
+        sigma_mm: sigmas.map(sigma_mm),
+        sigma_deg: sigmas.map(sigma_deg),
+    }
+}
+
+fn sigma_mm(sigmas: PoseSigmas) -> [f64; 3] {
+    sigmas.m.map(|m| 1e3 * m)
+}
+
+fn sigma_deg(sigmas: PoseSigmas) -> [f64; 3] {
+    sigmas.rad.map(f64::to_degrees)
 }
 
 fn given_from_corrected<'a>((camera, correction): (&'a String, &CameraCorrection)) -> (&'a str, [[f64; 4]; 4]) {
@@ -234,6 +281,23 @@ fn describe(printed: &Printed<'_>, calibration: &SceneCalibration, is_auto: bool
         }
         print::line(format!("parent_from_camera of {name}, row by row ({} images):", camera.n_images))?;
         print_matrix(&camera.parent_from_camera)?;
+        print_sigmas(camera.sigma_mm, camera.sigma_deg)?;
+        if let Some(relative) = &camera.relative {
+            print::line(format!("pose of {name} in the frame of {}, row by row:", relative.camera))?;
+            print_matrix(&relative.camera_from_this)?;
+            print_sigmas(relative.sigma_mm, relative.sigma_deg)?;
+        }
     }
+    Ok(())
+}
+
+fn print_sigmas(mm: Option<[f64; 3]>, deg: Option<[f64; 3]>) -> anyhow::Result<()> {
+    let (Some(mm), Some(deg)) = (mm, deg) else { return Ok(()) };
+    let list = |values: [f64; 3]| values.map(|value| format!("{value:.3}")).join(", ");
+    print::line(format!(
+        "standard deviations along and about the camera's x, y and z axes: {} mm; {} degrees",
+        list(mm),
+        list(deg)
+    ))?;
     Ok(())
 }
