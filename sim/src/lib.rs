@@ -57,8 +57,8 @@ pub mod layout {
 }
 
 pub use config::{
-    BaseConfig, CameraConfig, Config, DepthConfig, DepthSensor, Parent, ScannerConfig, Scene, SensorConfig, StampConfig,
-    TargetConfig,
+    BaseConfig, CameraConfig, Config, DepthConfig, DepthSensor, Parent, ScannerConfig, Scene, SensorConfig,
+    StampConfig, TargetConfig,
 };
 pub use error::Error;
 pub use live::{LiveRig, LiveTruth};
