@@ -10,7 +10,7 @@ use session::Table;
 use session::chart::{Axis, Chart, Line, Point, Scale};
 
 /// Conditions of the sweeps in the charts; each chart varies one of them.
-const BASE_SPREAD_DEG: f64 = 30.0;
+const BASE_SPREAD_DEG: f64 = 20.0;
 const BASE_POSES: usize = 12;
 
 pub(super) fn findings(options: &CalibrationOptions, results: &Results) -> Findings {

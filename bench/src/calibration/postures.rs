@@ -16,7 +16,8 @@ const HOME_RAD: [f64; 7] = [0.0, -0.5, 0.0, -2.2, 0.0, 0.0, 0.8];
 const WRIST_IX: usize = 5;
 /// Angles of joint 6 from the singularity, degrees.
 const ANGLES_DEG: [f64; 6] = [0.0, 2.0, 5.0, 15.0, 45.0, 90.0];
-/// Standard deviation of each joint around the posture, radians.
+/// Standard deviation of joint 6 and of the other joints around the posture, radians.
+const WRIST_SPREAD_RAD: f64 = 0.01;
 const SPREAD_RAD: f64 = 0.2;
 /// Standard deviation of the joint offsets, radians.
 const OFFSET_RAD: f64 = 0.004;
@@ -92,7 +93,9 @@ fn run(chain: &Chain, angle_deg: f64, estimates_joints: bool, seed: u64) -> Run 
         * Transform::new(Vector3::new(-0.1, -0.06, 0.5), Vector3::new(0.2, 0.1, 0.0));
     let mut samples = Vec::new();
     for _ in 0..MAX_ATTEMPTS {
-        let joints: Vec<f64> = home.iter().map(|joint| joint + SPREAD_RAD * random.normal()).collect();
+        let spread_rad = |ix: usize| if ix == WRIST_IX { WRIST_SPREAD_RAD } else { SPREAD_RAD };
+        let joints: Vec<f64> =
+            home.iter().enumerate().map(|(ix, joint)| joint + spread_rad(ix) * random.normal()).collect();
         let moved: Vec<f64> = joints.iter().zip(&offsets).map(|(joint, offset)| joint + offset).collect();
         let pose = (forward(&moved) * flange_from_camera).inverse() * base_from_board;
         let board = view(&lens, &pose, CORNER_PX, &mut random);
@@ -118,11 +121,10 @@ fn run(chain: &Chain, angle_deg: f64, estimates_joints: bool, seed: u64) -> Run 
         options: HandEyeOptions { estimate_joint_offsets: estimates_joints, ..HandEyeOptions::default() },
     };
     let found = calibrate_hand_eye(&input).ok()?;
-    // The offset of the last joint is equivalent to a rotation of the camera.
+    // The offset of the last joint is equivalent to a rotation of the camera; it is not estimated separately.
     let mut last = vec![0.0; home.len()];
     last[home.len() - 1] = offsets[home.len() - 1];
     let truth = forward(&vec![0.0; home.len()]).inverse() * forward(&last) * flange_from_camera;
-    let truth = if estimates_joints { truth } else { flange_from_camera };
     let deviation = |(offset, truth): (&calibration::hand_eye::JointOffset, &f64)| {
         let [value, sigma] = offset.estimate?;
         Some((value - truth).abs() / sigma)

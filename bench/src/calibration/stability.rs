@@ -9,8 +9,8 @@ use nalgebra::Vector3;
 use rayon::prelude::{IntoParallelIterator, IntoParallelRefIterator, ParallelIterator};
 use serde::Serialize;
 
-const SPREADS_DEG: [f64; 7] = [2.0, 5.0, 10.0, 20.0, 30.0, 45.0, 90.0];
-const POSES: [usize; 7] = [3, 4, 6, 8, 12, 20, 40];
+const SPREADS_DEG: [f64; 6] = [2.0, 5.0, 10.0, 20.0, 40.0, 90.0];
+const POSES: [usize; 6] = [3, 5, 8, 12, 20, 40];
 const WRONG_PERCENT: [u32; 5] = [0, 10, 20, 30, 40];
 const NOISE: Noise = Noise { corner_px: 0.2, robot_rad: 3e-4, robot_m: 3e-4 };
 

@@ -110,8 +110,8 @@ impl Default for HandEyeOptions {
             estimate_intrinsics: false,
             estimate_joint_offsets: false,
             board_is_seen: true,
-            max_sigma_m: 0.01,
-            max_sigma_rad: 1.0_f64.to_radians(),
+            max_sigma_m: 0.005,
+            max_sigma_rad: 0.5_f64.to_radians(),
         }
     }
 }
@@ -182,7 +182,7 @@ pub fn calibrate_hand_eye(input: &HandEyeInput<'_>) -> Result<HandEyeCalibration
         input.options.max_sigma_rad,
         input.setup == Setup::EyeInHand,
     )
-    .map_err(refused)?;
+    .map_err(|refusal| refused(refusal.with_warnings(&calibration.warnings)))?;
     Ok(calibration)
 }
 

@@ -22,4 +22,10 @@ impl Refusal {
     pub(crate) fn new(why: impl Into<String>, motion: impl Into<String>) -> Self {
         Self { why: why.into(), axis: None, motion: motion.into() }
     }
+
+    /// Adds warnings, which may be the cause: wrong intrinsics enlarge the uncertainty, for example.
+    pub(super) fn with_warnings(self, warnings: &[String]) -> Self {
+        let why = std::iter::once(self.why).chain(warnings.iter().cloned()).collect::<Vec<_>>().join("; ");
+        Self { why, ..self }
+    }
 }

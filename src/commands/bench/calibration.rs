@@ -12,7 +12,7 @@ pub(crate) struct Args {
     #[arg(long, value_name = "N", default_value_t = 200, value_parser = clap::value_parser!(u64).range(1..=100_000))]
     runs: u64,
     /// Scenes per number of poses and per combination of conditions
-    #[arg(long, value_name = "N", default_value_t = 5, value_parser = clap::value_parser!(u64).range(1..=1000))]
+    #[arg(long, value_name = "N", default_value_t = 4, value_parser = clap::value_parser!(u64).range(1..=1000))]
     seeds: u64,
     /// Also calibrate simulated rigs without a target: this rig file with wrong camera poses
     #[arg(long, value_name = "RIG_FILE")]
