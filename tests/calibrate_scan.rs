@@ -110,3 +110,49 @@ fn unusable_scans_are_rejected_with_the_reason() {
         assert!(matches!(output.status.code(), Some(1 | 2)) && printed.contains(expected), "{args:?}: {printed}");
     }
 }
+
+/// Two RGB-D cameras on the flange, both wrong by 3 degrees.
+#[test]
+fn scene_calibration_reports_the_pose_between_two_cameras() {
+    const SIDE: [f64; 3] = [-0.064, 0.037, 0.045];
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    let wrong_rotation = [0.3221026151663075, 0.295552456206855, 0.64243785574923784, 0.62942215756473185];
+    let right_rotation = [0.29883623873011983, 0.29883623873011983, 0.6408563820557885, 0.6408563820557885];
+    let camera = |name: &str, given_m: [f64; 3], given: [f64; 4], true_m: [f64; 3], truth: [f64; 4]| {
+        format!(
+            "[camera.{name}]\ndriver = \"sim\"\nsize_px = [160, 120]\nrate_hz = 8\nexposure_micros = 1000\n\
+             readout_micros = 15000\nparent = \"flange\"\n\
+             parent_from_camera = {{ xyz_m = {given_m:?}, quat_xyzw = {given:?} }}\n\
+             intrinsics = {{ focal_px = [153.65, 153.55], principal_px = [80.925, 59.1], lens = \"pinhole\" }}\n\
+             [camera.{name}.depth]\n[camera.{name}.sim.truth]\n\
+             parent_from_camera = {{ xyz_m = {true_m:?}, quat_xyzw = {truth:?} }}\n"
+        )
+    };
+    let urdf = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs/robots/panda.urdf");
+    let rig = [
+        format!("[arm]\ndriver = \"sim\"\nurdf = {:?}\nflange_link = \"panda_link8\"\n", urdf.display().to_string()),
+        camera("wrist", [0.064, 0.002, 0.046], wrong_rotation, [0.06, 0.0, 0.045], right_rotation),
+        camera("side", [-0.06, 0.04, 0.045], right_rotation, SIDE, wrong_rotation),
+    ];
+    std::fs::write(folder.join("rig.toml"), rig.concat()).expect("the disk has space");
+    let output = fieldrig(folder, &["calibrate", "scene", "rig.toml", "--sim", "--seconds", "10", "--json"]);
+    assert!(output.status.success(), "{}", stderr(&output));
+    let cameras = &json_of(&output)["cameras"];
+    assert!(cameras["side"]["relative"].is_null(), "{cameras}");
+    let relative = &cameras["wrist"]["relative"];
+    assert_eq!(relative["camera"], "side");
+    let [x, y, z, w] = wrong_rotation;
+    let side =
+        Transform::from_parts(Vector3::from(SIDE).into(), UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z)));
+    let found = numbers(&relative["camera_from_this"]).try_into().expect("16 numbers");
+    let error = (side.inverse() * true_pose()).inverse() * transform::from_rows(&found).expect("a rigid transform");
+    let (mm, degrees) = (1e3 * error.translation.vector.norm(), error.rotation.angle().to_degrees());
+    assert!(mm < 0.5 && degrees < 0.05, "{mm} mm, {degrees} degrees");
+    for holder in [relative, &cameras["side"], &cameras["wrist"]] {
+        for key in ["sigma_mm", "sigma_deg"] {
+            let sigmas = numbers(&holder[key]);
+            assert!(sigmas.len() == 3 && sigmas.iter().all(|sigma| *sigma > 0.0 && *sigma < 0.3), "{holder}");
+        }
+    }
+}

@@ -72,9 +72,16 @@ pub fn run(options: &CalibrationOptions) -> Result<BenchResult> {
         results.rigs.push(rigs::measure(rig, seed, options.scan_secs)?);
         log::info!("rig {seed}: {:?}", results.rigs.last());
         // An interrupted bench leaves results.
-        pages::findings(options, &results).write(&options.out)?;
+        write(options, &results)?;
     }
-    let findings = pages::findings(options, &results);
+    write(options, &results)
+}
+
+fn write(options: &CalibrationOptions, results: &Results) -> Result<BenchResult> {
+    let findings = pages::findings(options, results);
     let page = findings.write(&options.out)?;
+    let tables = options.out.join("calibration.md");
+    std::fs::write(&tables, pages::markdown(&findings.tables))
+        .with_context(|| format!("cannot write {}", tables.display()))?;
     Ok(BenchResult { findings, page, data_losses: Vec::new() })
 }

@@ -43,6 +43,16 @@ pub(super) fn findings(options: &CalibrationOptions, results: &Results) -> Findi
     }
 }
 
+/// The tables in Markdown.
+pub(super) fn markdown(tables: &[Table]) -> String {
+    let row = |cells: &[String]| format!("| {} |\n", cells.join(" | "));
+    let table = |table: &Table| {
+        let rows: String = table.rows.iter().map(|cells| row(cells)).collect();
+        format!("## {}\n\n{}{}\n{rows}\n", table.title, row(&table.head), "|---".repeat(table.head.len()) + "|")
+    };
+    tables.iter().map(table).collect()
+}
+
 fn axis(label: &str, scale: Scale, ticks: Vec<f64>) -> Axis {
     Axis { label: label.to_owned(), scale, ticks }
 }
@@ -328,5 +338,16 @@ fn rigs_table(results: &Results) -> Table {
         title: "Calibration without a target".into(),
         head: words(["rig", "images", "mm", "sigma, mm", "degrees", "sigma, degrees", "s", "goal reached"]),
         rows: results.rigs.iter().map(row).collect(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn tables_are_markdown() {
+        let table = Table { title: "Sizes".into(), head: words(["a", "b"]), rows: vec![words(["1", "2"])] };
+        assert_eq!(markdown(&[table]), "## Sizes\n\n| a | b |\n|---|---|\n| 1 | 2 |\n\n");
     }
 }
