@@ -128,12 +128,14 @@ fn intrinsics_run(seed: u64, lens: Lens, model: LensModel) -> Option<Run> {
 pub(super) fn chi_squared_cdf(x: f64, degrees_of_freedom: usize) -> f64 {
     /// Larger values have a probability of 1 in f64.
     const MAX: f64 = 300.0;
-    if !(x < MAX) {
+    let is_small = x < MAX; // False for NaN.
+    if !is_small {
         return 1.0;
     }
     let (a, half) = (0.5 * degrees_of_freedom as f64, 0.5 * x.max(0.0));
     // Gamma(a + 1) from Gamma(1) or Gamma(1/2).
-    let (mut gamma, mut at) = if degrees_of_freedom % 2 == 0 { (1.0, 1.0) } else { (std::f64::consts::PI.sqrt(), 0.5) };
+    let (mut gamma, mut at) =
+        if degrees_of_freedom.is_multiple_of(2) { (1.0, 1.0) } else { (std::f64::consts::PI.sqrt(), 0.5) };
     while at < a + 0.5 {
         gamma *= at;
         at += 1.0;

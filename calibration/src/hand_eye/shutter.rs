@@ -32,8 +32,8 @@ pub fn corners_at_mid_exposure(
         let at_mid = pose.camera_from_board * Point3::from(point.point_in_board);
         let at_row = motion.row_from_mid(point.pixel[1] / f64::from(intrinsics.size_px[1])) * at_mid;
         let pixels = intrinsics.project(&at_mid.coords).zip(intrinsics.project(&at_row.coords));
-        let Some((mid, row)) = pixels else { return point.clone() };
-        BoardPoint { pixel: [0, 1].map(|axis| point.pixel[axis] + mid[axis] - row[axis]), ..point.clone() }
+        let Some((mid, row)) = pixels else { return *point };
+        BoardPoint { pixel: [0, 1].map(|axis| point.pixel[axis] + mid[axis] - row[axis]), ..*point }
     };
     points.iter().map(corrected).collect()
 }

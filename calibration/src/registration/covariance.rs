@@ -110,8 +110,8 @@ mod tests {
         let sigmas = covariance.between("left", "right", &left_from_right).expect("both were estimated");
         // Along y and z, a rotation of the first camera moves the second one by its distance.
         let expected_m = [2e-6f64.sqrt(), 2.01e-6f64.sqrt(), 2.01e-6f64.sqrt()];
-        for axis in 0..3 {
-            assert!((sigmas.m[axis] - expected_m[axis]).abs() < 1e-12, "{sigmas:?}");
+        for (axis, expected_m) in expected_m.into_iter().enumerate() {
+            assert!((sigmas.m[axis] - expected_m).abs() < 1e-12, "{sigmas:?}");
             assert!((sigmas.rad[axis] - 2e-8f64.sqrt()).abs() < 1e-12, "{sigmas:?}");
         }
         let (covariance, left_from_right) = pair(1.0);

@@ -32,13 +32,14 @@ From a recording or the devices of a rig file, images are used in which the arm 
 
 const INPUT_HELP: &str = "Samples as JSON, a recording (.mcap), or a rig file (.toml) whose devices are read";
 
+const TARGET_HELP: &str = "With a recording or rig file: the target, such as charuco:5x7:34mm:26mm:5X5_100";
+
 /// Flags of `calibrate hand-eye`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
     #[arg(value_name = "SAMPLES.json|RECORDING|RIG", help = INPUT_HELP, long_help = SAMPLES_HELP)]
     samples: PathBuf,
-    /// With a recording or rig file: the target, such as charuco:5x7:34mm:26mm:5X5_100
-    #[arg(long, value_name = "SPEC", value_parser = target_argument)]
+    #[arg(long, value_name = "SPEC", value_parser = target_argument, help = TARGET_HELP)]
     target: Option<TargetSpec>,
     #[command(flatten)]
     scan: ScanFlags,
