@@ -93,13 +93,15 @@ pub fn with_intrinsics(rig: &Rig, name: &str, intrinsics: &Intrinsics) -> Result
     Ok(rig)
 }
 
-/// The rig with another pose of a camera.
+/// The rig with another pose of a camera. A pose in a fixed base is converted for a camera that is attached to the world.
 ///
 /// # Errors
 /// [`Error::BadInput`] if there is no such camera, or if it is attached to another frame than `parent`.
 pub fn with_extrinsics(rig: &Rig, name: &str, parent: Parent, pose: &Transform) -> Result<Rig, Error> {
     let given = camera(rig, name)?.parent;
-    if given != parent {
+    let is_converted = (parent, given) == (Parent::Base, Parent::World) && !rig.has_moving_base();
+    let pose = if is_converted { &(rig.base.world_from_base * pose) } else { pose };
+    if given != parent && !is_converted {
         return Err(Error::BadInput(format!(
             "--camera {name}: its parent in the rig file is {}, but the calibrated pose is relative to the {}; change parent, or the setup of the calibration",
             name_of(given),

@@ -76,7 +76,7 @@ pub use read_progress::{OnReadProgress, ReadProgress, ignore_progress};
 pub use recoveries::OpenGpu;
 pub use recovery::Recovery;
 pub use replay::Replay;
-pub use scene_calibration::{SCENE_PARAMS, SceneCalibration, calibrate_scene};
+pub use scene_calibration::{RelativePose, SCENE_PARAMS, SceneCalibration, calibrate_scene};
 pub use session::{EndingSession, Evaluators, FinishedModel, Limits, Session, TrainingOutcome, finish};
 pub use stored_keyframes::StoredKeyframes;
 pub use table::Table;

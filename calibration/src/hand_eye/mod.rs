@@ -24,6 +24,7 @@ mod samples;
 #[cfg(test)]
 pub(crate) mod scene;
 mod selection;
+mod shutter;
 #[cfg(test)]
 mod tests;
 
@@ -35,6 +36,7 @@ pub use next_poses::{NextPose, NextPoseOptions, suggest_next_poses};
 pub use pose_fit::HandEyeNoise;
 pub use refusal::Refusal;
 pub use report::{HandEyeCalibration, JointOffset, SampleReport, SampleStatus};
+pub use shutter::{FlangeMotion, corners_at_mid_exposure};
 
 use crate::{BoardView, Error};
 use kinematics::{Chain, Intrinsics, Transform, transform};
@@ -110,8 +112,8 @@ impl Default for HandEyeOptions {
             estimate_intrinsics: false,
             estimate_joint_offsets: false,
             board_is_seen: true,
-            max_sigma_m: 0.01,
-            max_sigma_rad: 1.0_f64.to_radians(),
+            max_sigma_m: 0.005,
+            max_sigma_rad: 0.5_f64.to_radians(),
         }
     }
 }
@@ -182,7 +184,10 @@ pub fn calibrate_hand_eye(input: &HandEyeInput<'_>) -> Result<HandEyeCalibration
         input.options.max_sigma_rad,
         input.setup == Setup::EyeInHand,
     )
-    .map_err(|refusal| refused(with_doubt(refusal, refined.intrinsics_doubt.as_deref())))?;
+    .map_err(|refusal| {
+        let doubt = refined.intrinsics_doubt.as_deref();
+        refused(with_doubt(refusal.with_warnings(&calibration.warnings, doubt), doubt))
+    })?;
     Ok(calibration)
 }
 

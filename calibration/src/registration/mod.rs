@@ -10,6 +10,7 @@
 //! threads.
 
 mod corrections;
+mod covariance;
 mod features;
 mod fit;
 mod layout;
@@ -27,6 +28,7 @@ pub(crate) mod tests;
 mod validation;
 mod view;
 
+pub use covariance::{ExtrinsicsCovariance, PoseSigmas};
 pub use movement::{CameraMovement, MOVEMENT_WINDOW, MovementDetector};
 pub use report::{Alignment, Estimate, PoseEstimate, ScalarEstimate, Unobservable};
 pub use station::{StationCorrection, register_station};

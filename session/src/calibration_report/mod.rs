@@ -13,7 +13,7 @@ mod time_offset;
 
 pub use hand_eye::HandEyeReport;
 pub use intrinsics::IntrinsicsReport;
-pub use photo::Photos;
+pub use photo::{Photo, Photos};
 pub use scene::SceneReport;
 pub use time_offset::TimeOffsetReport;
 

@@ -5,6 +5,7 @@ use super::page;
 use crate::error::Context;
 use crate::inline_picture::{data_uri, fit_size};
 use calibration::PointFit;
+use image::DynamicImage;
 use image::imageops::FilterType;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -13,14 +14,28 @@ use std::path::{Path, PathBuf};
 const MAX_SIDE_PX: u32 = 800;
 const QUALITY: u8 = 78;
 
-/// Files of the images, by name.
-pub type Photos = BTreeMap<String, PathBuf>;
+/// An image that a report can show.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Photo {
+    /// An image file.
+    File(PathBuf),
+    /// A gray image in memory.
+    Gray {
+        /// Width and height, pixels.
+        size_px: [u32; 2],
+        /// Gray values, row by row.
+        pixels: Vec<u8>,
+    },
+}
+
+/// The images, by name.
+pub type Photos = BTreeMap<String, Photo>;
 
 /// The part of a photo around the corners, with the corners drawn over it, and a caption. Without corners, the whole
 /// photo. Empty if the photo cannot be read again.
 pub(super) fn with_corners(photos: &Photos, name: &str, caption: &str, points: &[PointFit]) -> String {
-    let Some(file) = photos.get(name) else { return String::new() };
-    match embedded(file, points) {
+    let Some(photo) = photos.get(name) else { return String::new() };
+    match embedded(photo, points) {
         Ok((uri, part)) => {
             let mut map = ImageMap::of_part(part);
             map.photo(&uri);
@@ -28,17 +43,21 @@ pub(super) fn with_corners(photos: &Photos, name: &str, caption: &str, points: &
             page::figure(caption, &map.svg(caption))
         }
         Err(error) => {
-            log::warn!("the report shows no picture of {}: {error:#}", file.display());
+            log::warn!("the report shows no picture of {name}: {error:#}");
             String::new()
         }
     }
 }
 
 /// A small copy of the part of an image around the corners, as a data URI, and the part.
-fn embedded(file: &Path, points: &[PointFit]) -> crate::Result<(String, ImagePart)> {
-    let in_file = || format!("cannot read {}", file.display());
-    let reader = image::ImageReader::open(file).with_context(in_file)?.with_guessed_format().with_context(in_file)?;
-    let picture = reader.decode().with_context(in_file)?;
+fn embedded(photo: &Photo, points: &[PointFit]) -> crate::Result<(String, ImagePart)> {
+    let picture = match photo {
+        Photo::File(file) => read(file)?,
+        Photo::Gray { size_px: [width, height], pixels } => {
+            let gray = image::GrayImage::from_raw(*width, *height, pixels.clone());
+            gray.context("the image has fewer pixels than its size")?.into()
+        }
+    };
     let part = around(points, [picture.width(), picture.height()]);
     let ImagePart { first_px: [x, y], size_px: [width, height] } = part;
     let picture = picture.crop_imm(x, y, width, height);
@@ -47,6 +66,12 @@ fn embedded(file: &Path, points: &[PointFit]) -> crate::Result<(String, ImagePar
     let small =
         if small_px == part.size_px { picture } else { picture.resize_exact(width, height, FilterType::Triangle) };
     Ok((data_uri(&small.into_rgb8(), small_px, QUALITY)?, part))
+}
+
+fn read(file: &Path) -> crate::Result<DynamicImage> {
+    let in_file = || format!("cannot read {}", file.display());
+    let reader = image::ImageReader::open(file).with_context(in_file)?.with_guessed_format().with_context(in_file)?;
+    reader.decode().with_context(in_file)
 }
 
 /// The part of an image that contains all corners and a margin.
@@ -88,9 +113,16 @@ mod tests {
 
     #[test]
     fn unreadable_photo_is_left_out() {
-        let photos = Photos::from([("a.png".to_owned(), PathBuf::from("does-not-exist.png"))]);
+        let photos = Photos::from([("a.png".to_owned(), Photo::File("does-not-exist.png".into()))]);
         assert_eq!(with_corners(&photos, "a.png", "a", &[]), "");
         assert_eq!(with_corners(&photos, "b.png", "b", &[]), "");
+    }
+
+    #[test]
+    fn images_in_memory_are_shown() {
+        let photo = |pixels: Vec<u8>| Photos::from([("a".to_owned(), Photo::Gray { size_px: [8, 6], pixels })]);
+        assert!(with_corners(&photo(vec![128; 48]), "a", "a", &[]).contains("data:image/jpeg"));
+        assert_eq!(with_corners(&photo(vec![128; 47]), "a", "a", &[]), "");
     }
 
     #[test]

@@ -3,8 +3,9 @@
 use super::Heading;
 use super::page::{self, Page};
 use crate::SceneCalibration;
-use calibration::{Estimate, PoseEstimate, ScalarEstimate, Trial};
+use calibration::{Estimate, PoseEstimate, PoseSigmas, ScalarEstimate, Trial};
 use capture::config::Rig;
+use kinematics::Transform;
 
 /// Contents of the report.
 #[derive(Clone, Debug)]
@@ -53,6 +54,8 @@ impl SceneReport<'_> {
             let unobservable = calibration.alignment.unobservable.iter().map(|direction| vec![direction.to_string()]);
             page.table("Directions that the motion does not determine", &["combination"], unobservable.collect());
             page.table("Poses of the cameras", &POSE_HEAD, self.poses(calibration));
+            page.table("Standard deviations of the poses", &SIGMA_HEAD, self.sigmas(calibration));
+            page.table("Poses between cameras", &POSE_HEAD, self.relative_poses(calibration));
         }
         page.finish()
     }
@@ -88,18 +91,36 @@ impl SceneReport<'_> {
     /// Poses relative to the parents, before and after.
     fn poses(&self, calibration: &SceneCalibration) -> Vec<Vec<String>> {
         let (Some(before), Some(after)) = (self.rig, &calibration.rig) else { return Vec::new() };
-        let pose = |name: String, pose: &kinematics::Transform| {
-            let [x, y, z]: [f64; 3] = (1e3 * pose.translation.vector).into();
-            let [qx, qy, qz, qw]: [f64; 4] = pose.rotation.coords.into();
-            vec![name, format!("{x:.2}, {y:.2}, {z:.2}"), format!("{qx:.5}, {qy:.5}, {qz:.5}, {qw:.5}")]
-        };
         let both = before.cameras.iter().zip(&after.cameras).flat_map(|(before, after)| {
             [
-                pose(format!("{} before", &*before.name), &before.parent_from_camera),
-                pose(format!("{} after", &*after.name), &after.parent_from_camera),
+                pose(format!("{} before, in the parent", &*before.name), &before.parent_from_camera),
+                pose(format!("{} after, in the parent", &*after.name), &after.parent_from_camera),
             ]
         });
         both.collect()
+    }
+
+    /// Standard deviations of the poses in the parents and between cameras, along and about the axes of the camera.
+    fn sigmas(&self, calibration: &SceneCalibration) -> Vec<Vec<String>> {
+        let row = |name: String, sigmas: PoseSigmas| {
+            let list = |values: [f64; 3]| values.map(|value| format!("{value:.3}")).join(", ");
+            vec![name, list(sigmas.m.map(|m| 1e3 * m)), list(sigmas.rad.map(f64::to_degrees))]
+        };
+        let of_camera = |(name, _): &(String, usize)| {
+            let own = calibration.sigmas(name).map(|sigmas| row(format!("{name} in its parent"), sigmas));
+            let relative = calibration.relative(name);
+            let relative = relative.and_then(|found| Some(row(format!("{name} in {}", found.first), found.sigmas?)));
+            own.into_iter().chain(relative)
+        };
+        self.n_images.iter().flat_map(of_camera).collect()
+    }
+
+    fn relative_poses(&self, calibration: &SceneCalibration) -> Vec<Vec<String>> {
+        let of_camera = |(name, _): &(String, usize)| {
+            let relative = calibration.relative(name)?;
+            Some(pose(format!("{name} in {}", relative.first), &relative.first_from_camera))
+        };
+        self.n_images.iter().filter_map(of_camera).collect()
     }
 
     fn rows(&self, estimate: &Estimate) -> Vec<Vec<String>> {
@@ -134,7 +155,14 @@ impl SceneReport<'_> {
     }
 }
 
-const POSE_HEAD: [&str; 3] = ["camera", "position in the parent (x, y, z), mm", "rotation (quaternion x, y, z, w)"];
+const POSE_HEAD: [&str; 3] = ["camera", "position (x, y, z), mm", "rotation (quaternion x, y, z, w)"];
+const SIGMA_HEAD: [&str; 3] = ["camera", "along its axes (x, y, z), mm", "about its axes (x, y, z), °"];
+
+fn pose(name: String, pose: &Transform) -> Vec<String> {
+    let [x, y, z]: [f64; 3] = (1e3 * pose.translation.vector).into();
+    let [qx, qy, qz, qw]: [f64; 4] = pose.rotation.coords.into();
+    vec![name, format!("{x:.2}, {y:.2}, {z:.2}"), format!("{qx:.5}, {qy:.5}, {qz:.5}, {qw:.5}")]
+}
 
 fn pose_rows(what: &str, estimate: &PoseEstimate) -> Vec<Vec<String>> {
     let direction = |[x, y, z]: [f64; 3]| format!("({x:.2} {y:.2} {z:.2})");

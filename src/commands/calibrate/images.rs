@@ -1,9 +1,9 @@
-//! Reads image files and detects a target in them.
+//! Reads image files, and detects a target in images.
 
 use crate::exit::BadArgument;
 use crate::print;
 use calibration::{BoardPoint, BoardView};
-use session::calibration_report::{Photos, Unused};
+use session::calibration_report::{Photo, Photos, Unused};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use targets::{Detection, GrayImage, TargetSpec};
@@ -11,9 +11,8 @@ use targets::{Detection, GrayImage, TargetSpec};
 /// The target in one image.
 #[derive(Debug)]
 pub(super) struct DetectedImage {
-    /// Name of the file.
+    /// Name of the file, or time in the recording.
     pub(super) name: String,
-    pub(super) path: PathBuf,
     /// The target, or the reason why it was not found.
     pub(super) board: Result<Board, NoBoard>,
 }
@@ -82,28 +81,41 @@ pub(super) fn detect(
     target: &TargetSpec,
     is_hidden: bool,
 ) -> Result<Vec<DetectedImage>, BadArgument> {
-    let bar = print::bar(Some(files.len() as u64), "{bar:30} {pos} of {len} images", is_hidden);
+    let detected = detect_each(files, is_hidden, |ImageFile { name, path }| DetectedImage {
+        name: name.clone(),
+        board: detect_in_file(path, name, target),
+    });
+    check_readable(&detected)?;
+    Ok(detected)
+}
+
+/// Calls a function for each image, on all processors; the results are in the order of the images.
+///
+/// * `is_hidden`: no progress bar.
+pub(super) fn detect_each<T: Sync>(
+    images: &[T],
+    is_hidden: bool,
+    detect: impl Fn(&T) -> DetectedImage + Sync,
+) -> Vec<DetectedImage> {
+    let bar = print::bar(Some(images.len() as u64), "{bar:30} {pos} of {len} images", is_hidden);
     let next = AtomicUsize::new(0);
     let detect_some = || {
         let mut detected = Vec::new();
         loop {
             let ix = next.fetch_add(1, Ordering::Relaxed);
-            let Some(ImageFile { name, path }) = files.get(ix).cloned() else { return detected };
-            let board = detect_in(&path, &name, target);
-            detected.push((ix, DetectedImage { name, path, board }));
+            let Some(image) = images.get(ix) else { return detected };
+            detected.push((ix, detect(image)));
             bar.inc(1);
         }
     };
-    let n_threads = std::thread::available_parallelism().map_or(1, |n| n.get().min(files.len()));
+    let n_threads = std::thread::available_parallelism().map_or(1, |n| n.get().min(images.len()));
     let mut detected: Vec<_> = std::thread::scope(|scope| {
         let threads: Vec<_> = (0..n_threads).map(|_| scope.spawn(detect_some)).collect();
         threads.into_iter().flat_map(|thread| thread.join().expect("detection does not panic")).collect()
     });
     bar.finish_and_clear();
     detected.sort_by_key(|(ix, _)| *ix);
-    let detected: Vec<DetectedImage> = detected.into_iter().map(|(_, image)| image).collect();
-    check_readable(&detected)?;
-    Ok(detected)
+    detected.into_iter().map(|(_, image)| image).collect()
 }
 
 fn check_readable(images: &[DetectedImage]) -> Result<(), BadArgument> {
@@ -121,13 +133,17 @@ fn check_readable(images: &[DetectedImage]) -> Result<(), BadArgument> {
     Ok(())
 }
 
-fn detect_in(path: &Path, name: &str, target: &TargetSpec) -> Result<Board, NoBoard> {
+fn detect_in_file(path: &Path, name: &str, target: &TargetSpec) -> Result<Board, NoBoard> {
     let unreadable = |error: image::ImageError| NoBoard::Unreadable(error.to_string());
     let reader = image::ImageReader::open(path).and_then(image::ImageReader::with_guessed_format);
     let gray = reader.map_err(|error| unreadable(error.into()))?.decode().map_err(unreadable)?.into_luma8();
     let size_px = [gray.width(), gray.height()];
-    let detection = target.detect(GrayImage { size_px, pixels: gray.as_raw() })?;
-    Ok(Board { size_px, view: view(name, &detection) })
+    detect_in_gray(GrayImage { size_px, pixels: gray.as_raw() }, name, target)
+}
+
+/// Detects a target in an image. `name` is used in messages.
+pub(super) fn detect_in_gray(image: GrayImage<'_>, name: &str, target: &TargetSpec) -> Result<Board, NoBoard> {
+    Ok(Board { size_px: image.size_px, view: view(name, &target.detect(image)?) })
 }
 
 fn view(name: &str, detection: &Detection) -> BoardView {
@@ -137,8 +153,8 @@ fn view(name: &str, detection: &Detection) -> BoardView {
 }
 
 /// The files of images, for a report.
-pub(super) fn photos(images: &[DetectedImage]) -> Photos {
-    images.iter().map(|image| (image.name.clone(), image.path.clone())).collect()
+pub(super) fn photos(files: &[ImageFile]) -> Photos {
+    files.iter().map(|file| (file.name.clone(), Photo::File(file.path.clone()))).collect()
 }
 
 /// The images without the target, for a report.

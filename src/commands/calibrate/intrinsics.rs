@@ -2,7 +2,8 @@
 
 use super::images;
 use super::lens::LensFile;
-use super::outputs::{self, ReportFlag, RigFlags};
+use super::outputs::{self, ReportFlag, RigFlags, RigOutput};
+use super::scan::ScanOptions;
 use super::target_argument;
 use crate::exit::{Exit, InsufficientData};
 use crate::print;
@@ -21,9 +22,10 @@ const TARGET_HELP: &str =
 /// Flags of `calibrate intrinsics`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// Folder of images (.jpg, .png) of the target, all of one camera and one size
-    #[arg(value_name = "IMAGES")]
-    folder: PathBuf,
+    /// Folder of images (.jpg, .png) of the target, all of one camera and one size; or a recording (.mcap) or rig file
+    /// (.toml) whose camera sees the target
+    #[arg(value_name = "IMAGES|RECORDING|RIG")]
+    input: PathBuf,
     #[arg(long, value_name = "SPEC", value_parser = target_argument, help = TARGET_HELP)]
     target: TargetSpec,
     /// Lens model
@@ -112,13 +114,16 @@ struct Detected {
     /// Images without the target.
     unused: Vec<Unused>,
     photos: Photos,
+    /// Why there are no images.
+    no_images: Option<String>,
+    warnings: Vec<String>,
 }
 
 /// Detects the target, calibrates, and prints the result.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let report = args.report.open()?;
-    let mut rig = args.rig.open()?;
-    let detected = args.detect()?;
+    let mut rig = args.rig.open(&args.input)?;
+    let detected = args.detect(report.is_some(), rig.as_mut())?;
     if let (Some(rig), Some(size_px)) = (&rig, detected.sizes_px.first()) {
         rig.expect_size(*size_px)?;
     }
@@ -144,24 +149,37 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
 }
 
 impl Args {
-    fn detect(&self) -> anyhow::Result<Detected> {
-        let images = images::detect(&images::files(&self.folder)?, &self.target, self.json)?;
-        let (unused, photos) = (images::unused(&images), images::photos(&images));
+    /// Reads the images and detects the target. `output` gets the calibration that devices report.
+    fn detect(&self, keeps_photos: bool, output: Option<&mut RigOutput>) -> anyhow::Result<Detected> {
+        let options = ScanOptions { keeps_photos, is_hidden: self.json };
+        let (images, photos, no_images, warnings) =
+            match self.rig.read(&self.input, Some(&self.target), options, output)? {
+                Some(mut scan) => (scan.detected(), scan.take_photos(), scan.no_images, scan.warnings),
+                None => {
+                    let files = images::files(&self.input)?;
+                    let images = images::detect(&files, &self.target, self.json)?;
+                    (images, images::photos(&files), None, Vec::new())
+                }
+            };
+        let unused = images::unused(&images);
         let (mut views, mut sizes_px) = (Vec::new(), Vec::new());
         for board in images.into_iter().filter_map(|image| image.board.ok()) {
             views.push(board.view);
             sizes_px.push(board.size_px);
         }
-        Ok(Detected { views, sizes_px, unused, photos })
+        Ok(Detected { views, sizes_px, unused, photos, no_images, warnings })
     }
 
     fn calibrate(&self, detected: &Detected) -> anyhow::Result<IntrinsicsCalibration> {
-        let Detected { views, sizes_px, unused, .. } = detected;
+        let Detected { views, sizes_px, unused, no_images, .. } = detected;
+        if let Some(reason) = no_images {
+            return Err(InsufficientData(reason.clone()).into());
+        }
         if views.is_empty() {
             // All images usually fail for the same reason.
             let reason = unused.first().map_or(String::new(), |first| format!("; {}: {}", first.name, first.reason));
-            let (folder, target, n) = (self.folder.display(), &self.target, unused.len());
-            let text = format!("{folder}: {target} was not detected in any of {n} images{reason}");
+            let (input, target, n) = (self.input.display(), &self.target, unused.len());
+            let text = format!("{input}: {target} was not detected in any of {n} images{reason}");
             return Err(InsufficientData(text).into());
         }
         Ok(calibrate_intrinsics(&IntrinsicsInput { views, sizes_px, model: self.model.into() })?)
@@ -174,8 +192,8 @@ impl Args {
         result: &anyhow::Result<IntrinsicsCalibration>,
     ) -> anyhow::Result<()> {
         let calibration = result.as_ref().ok();
-        let warnings = calibration.and_then(uncertainty_warning).into_iter().collect();
-        let Some(heading) = outputs::heading(&self.folder, result, warnings) else { return Ok(()) };
+        let warnings = detected.warnings.iter().cloned().chain(calibration.and_then(uncertainty_warning)).collect();
+        let Some(heading) = outputs::heading(&self.input, result, warnings) else { return Ok(()) };
         let rig_line =
             calibration.map(|calibration| format!("intrinsics = {}", LensFile::of(&calibration.intrinsics).to_toml()));
         const NO_IMAGE_PX: [u32; 2] = [640, 480];

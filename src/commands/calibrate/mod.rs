@@ -6,6 +6,7 @@ mod intrinsics;
 mod json_object;
 mod lens;
 mod outputs;
+mod scan;
 mod scene;
 mod target;
 mod time_offset;

@@ -1,11 +1,11 @@
 //! `fieldrig calibrate scene`: calibrates the cameras of a rig from images of a static scene.
 
-use super::outputs::{self, ReportFlag};
+use super::outputs::{self, ReportFlag, is_rig_file};
 use super::{matrix_of, print_matrix};
 use crate::console::ReadBar;
 use crate::exit::{self, BadArgument, Exit, InsufficientData};
 use crate::{print, signals};
-use calibration::{CameraCorrection, Estimate, Trial, rigid_transform};
+use calibration::{CameraCorrection, Estimate, PoseSigmas, Trial, rigid_transform};
 use capture::config::{Override, Rig};
 use capture::open::{self, Devices};
 use drivers::Sample;
@@ -13,7 +13,9 @@ use keyframe::listed;
 use kinematics::Stamp;
 use serde::Serialize;
 use session::calibration_report::SceneReport;
-use session::{Data, DataOptions, Purpose, Refine, SCENE_PARAMS, SceneCalibration, calibrate_scene, corrected_rig};
+use session::{
+    Data, DataOptions, Purpose, Refine, RelativePose, SCENE_PARAMS, SceneCalibration, calibrate_scene, corrected_rig,
+};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
@@ -77,10 +79,25 @@ struct PrintedCamera {
     /// Why its extrinsics are those of the rig file.
     refused: Option<String>,
     parent_from_camera: [[f64; 4]; 4],
+    /// Standard deviations along and about the axes of the camera; null if its extrinsics were not estimated.
+    sigma_mm: Option<[f64; 3]>,
+    sigma_deg: Option<[f64; 3]>,
+    /// Pose in the frame of the first camera with the same parent; null for that camera.
+    relative: Option<PrintedRelative>,
     focal_px: [f64; 2],
     principal_px: [f64; 2],
     /// Time from the stamps of the images to mid-exposure, milliseconds.
     stamp_to_mid_exposure_millis: Option<f64>,
+}
+
+/// Pose of a camera in the frame of another one.
+#[derive(Debug, Serialize)]
+struct PrintedRelative {
+    camera: String,
+    camera_from_this: [[f64; 4]; 4],
+    /// Standard deviations along and about the axes of this camera; null if they are unknown.
+    sigma_mm: Option<[f64; 3]>,
+    sigma_deg: Option<[f64; 3]>,
 }
 
 /// Calibrates and prints the estimates. Exit code 4 if the data do not determine the extrinsics of any camera.
@@ -216,16 +233,16 @@ impl Args {
     }
 }
 
-fn is_rig_file(path: &Path) -> bool {
-    path.extension().is_some_and(|extension| extension == "toml")
-}
-
 fn printed<'a>(data: &Data, calibration: &'a SceneCalibration, refused: Option<String>) -> Printed<'a> {
     let cameras = calibration.rig.iter().flat_map(|rig| &rig.cameras).map(|camera| {
+        let sigmas = calibration.sigmas(&camera.name);
         let printed = PrintedCamera {
             n_images: data.keyframes.iter().filter(|keyframe| *keyframe.camera == *camera.name).count(),
             refused: calibration.refused.get(&*camera.name).cloned(),
             parent_from_camera: matrix_of(&camera.parent_from_camera),
+            sigma_mm: sigmas.map(sigma_mm),
+            sigma_deg: sigmas.map(sigma_deg),
+            relative: calibration.relative(&camera.name).map(relative),
             focal_px: camera.intrinsics.focal_px,
             principal_px: camera.intrinsics.principal_px,
             stamp_to_mid_exposure_millis: camera.stamp_to_mid_exposure.as_ref().map(|offset| offset.value_millis),
@@ -245,6 +262,24 @@ fn printed<'a>(data: &Data, calibration: &'a SceneCalibration, refused: Option<S
         unobservable: alignment.unobservable.iter().map(ToString::to_string).collect(),
         refused,
     }
+}
+
+fn relative(relative: RelativePose) -> PrintedRelative {
+    let RelativePose { first, first_from_camera, sigmas } = relative;
+    PrintedRelative {
+        camera: first,
+        camera_from_this: matrix_of(&first_from_camera),
+        sigma_mm: sigmas.map(sigma_mm),
+        sigma_deg: sigmas.map(sigma_deg),
+    }
+}
+
+fn sigma_mm(sigmas: PoseSigmas) -> [f64; 3] {
+    sigmas.m.map(|m| 1e3 * m)
+}
+
+fn sigma_deg(sigmas: PoseSigmas) -> [f64; 3] {
+    sigmas.rad.map(f64::to_degrees)
 }
 
 fn given_from_corrected<'a>((camera, correction): (&'a String, &CameraCorrection)) -> (&'a str, [[f64; 4]; 4]) {
@@ -276,6 +311,23 @@ fn describe(printed: &Printed<'_>, calibration: &SceneCalibration, is_auto: bool
         }
         print::line(format!("parent_from_camera of {name}, row by row ({} images):", camera.n_images))?;
         print_matrix(&camera.parent_from_camera)?;
+        print_sigmas(camera.sigma_mm, camera.sigma_deg)?;
+        if let Some(relative) = &camera.relative {
+            print::line(format!("pose of {name} in the frame of {}, row by row:", relative.camera))?;
+            print_matrix(&relative.camera_from_this)?;
+            print_sigmas(relative.sigma_mm, relative.sigma_deg)?;
+        }
     }
+    Ok(())
+}
+
+fn print_sigmas(mm: Option<[f64; 3]>, deg: Option<[f64; 3]>) -> anyhow::Result<()> {
+    let (Some(mm), Some(deg)) = (mm, deg) else { return Ok(()) };
+    let list = |values: [f64; 3]| values.map(|value| format!("{value:.3}")).join(", ");
+    print::line(format!(
+        "standard deviations along and about the camera's x, y and z axes: {} mm; {} degrees",
+        list(mm),
+        list(deg)
+    ))?;
     Ok(())
 }

@@ -2,20 +2,24 @@
 
 mod printed;
 mod samples_file;
+mod source;
 
-use super::outputs::{self, ReportFlag, RigFlags};
-use crate::exit::{self, Exit, InsufficientData};
+use super::outputs::{self, ReportFlag, RigFlags, RigOutput};
+use super::scan::ScanOptions;
+use super::target_argument;
+use crate::exit::{self, BadArgument, Exit, InsufficientData};
 use crate::print;
 use anyhow::Context;
 use calibration::hand_eye::{
     HandEyeCalibration, HandEyeInput, HandEyeOptions, NextPose, NextPoseOptions, calibrate_hand_eye, suggest_next_poses,
 };
 use kinematics::urdf::Robot;
-use kinematics::{Chain, Transform};
+use kinematics::{Chain, Intrinsics, Transform};
 use nalgebra::Vector3;
 use printed::{Printed, PrintedPose, PrintedSample};
 use samples_file::{Samples, SamplesFile};
 use session::calibration_report::HandEyeReport;
+use source::Source;
 use std::path::{Path, PathBuf};
 use targets::TargetSpec;
 
@@ -28,19 +32,27 @@ const SAMPLES_HELP: &str = r#"Samples as JSON:
 
 Instead of an image, a sample may contain the pose of the board, "camera_from_board"; then intrinsics and target are not
 needed. With the setup "eye-to-hand", the camera is fixed and the board moves with the flange. Lengths in meters, matrices
-row by row, pixel centers at +0.5, image files relative to this file."#;
+row by row, pixel centers at +0.5, image files relative to this file.
+
+From a recording or the devices of a rig file, images are used in which the arm is slow and the target visible."#;
+
+const INPUT_HELP: &str = "Samples as JSON, a recording (.mcap), or a rig file (.toml) whose devices are read";
+
+const TARGET_HELP: &str = "With a recording or rig file: the target, such as charuco:5x7:34mm:26mm:5X5_100";
 
 /// Flags of `calibrate hand-eye`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    #[arg(value_name = "SAMPLES.json", help = "Samples as JSON", long_help = SAMPLES_HELP)]
-    samples: PathBuf,
+    #[arg(value_name = "SAMPLES.json|RECORDING|RIG", help = INPUT_HELP, long_help = SAMPLES_HELP)]
+    input: PathBuf,
+    #[arg(long, value_name = "SPEC", value_parser = target_argument, help = TARGET_HELP)]
+    target: Option<TargetSpec>,
     /// Also estimate the intrinsics, starting from those in the file; needs images
     #[arg(long)]
     with_intrinsics: bool,
-    /// Also estimate the offsets of all joints except the first and the last; needs images, "joints" in the samples,
-    /// --urdf and --tip
-    #[arg(long, requires_all = ["urdf", "tip"])]
+    /// Also estimate the offsets of all joints except the first and the last. With samples in JSON: needs images,
+    /// "joints" in the samples, --urdf and --tip
+    #[arg(long)]
     with_joints: bool,
     /// Robot description of the arm
     #[arg(long, value_name = "FILE.urdf", requires = "tip")]
@@ -62,24 +74,26 @@ struct Calibrated {
     calibration: HandEyeCalibration,
     next_poses: Vec<NextPose>,
     /// Intrinsics that were given or estimated; `None` without images.
-    intrinsics: Option<kinematics::Intrinsics>,
+    intrinsics: Option<Intrinsics>,
+    /// `parent_from_camera` for the rig file.
+    rig_pose: Transform,
 }
 
 /// Calibrates and prints the result. Exit code 4 if the samples do not determine it.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let report = args.report.open()?;
-    let mut rig = args.rig.open()?;
-    let file = SamplesFile::read(&args.samples)?;
+    let mut rig = args.rig.open(&args.input)?;
+    let mut source = args.source(report.is_some(), rig.as_mut())?;
     if let Some(rig) = &rig {
-        rig.expect_setup(file.setup)?;
+        rig.expect_setup(source.setup())?;
     }
-    let samples = file.detect(args.json)?;
+    let samples = source.samples(args.json)?;
     if let (Some(rig), Some(size_px)) = (&rig, samples.size_px) {
         rig.expect_size(size_px)?;
     }
-    let result = args.calibrate(&file, &samples).map_err(|error| with_reason(error, &file, &samples));
+    let result = args.calibrate(&source, &samples).map_err(|error| with_reason(error, &source, &samples));
     if let Some(path) = report {
-        write_report(path, &args.samples, &file, &samples, &result)?;
+        write_report(path, &args.input, &source, &samples, &result)?;
     }
     let mut printed = match &result {
         Ok(calibrated) => Printed {
@@ -87,7 +101,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
             ..printed::printed(&calibrated.calibration)
         },
         Err(error) if exit::of(error) == Exit::InsufficientData && args.json => {
-            Printed::refused(file.setup, format!("{error:#}"))
+            Printed::refused(source.setup(), format!("{error:#}"))
         }
         Err(_) => return result.map(|_| Exit::Done),
     };
@@ -95,7 +109,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     if args.json {
         print::json(&printed)?
     } else {
-        printed::describe(&printed)?
+        printed::describe(&printed, result.as_ref().ok().map(|found| &found.rig_pose))?
     }
     let Ok(Calibrated { calibration, intrinsics, .. }) = result else { return Ok(Exit::InsufficientData) };
     if let Some(rig) = &mut rig {
@@ -105,16 +119,23 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
             (None, Some(given)) => rig.warn_if_intrinsics_differ(&given)?,
             (None, None) => (),
         }
+        match source {
+            Source::Scan { .. } => rig.add_joint_offsets(&calibration.joint_offsets),
+            Source::File(_) if !calibration.joint_offsets.is_empty() => {
+                log::warn!("joint offsets are not written into the rig file; add them to arm.joint_offsets");
+            }
+            Source::File(_) => (),
+        }
         rig.write()?;
     }
     Ok(Exit::Done)
 }
 
 /// A refusal with the reason why images were not used.
-fn with_reason(error: anyhow::Error, file: &SamplesFile, samples: &Samples) -> anyhow::Error {
+fn with_reason(error: anyhow::Error, source: &Source, samples: &Samples) -> anyhow::Error {
     match samples.unused.first() {
         Some(first) if exit::of(&error) == Exit::InsufficientData => {
-            let (n, n_all) = (samples.unused.len(), file.len());
+            let (n, n_all) = (samples.unused.len(), source.n_samples());
             let (name, reason) = (&first.name, &first.reason);
             let text = format!("{error:#}; {n} of {n_all} images do not show the target: {name}: {reason}");
             InsufficientData(text).into()
@@ -126,20 +147,21 @@ fn with_reason(error: anyhow::Error, file: &SamplesFile, samples: &Samples) -> a
 fn write_report(
     path: &Path,
     input: &Path,
-    file: &SamplesFile,
+    source: &Source,
     samples: &Samples,
     result: &anyhow::Result<Calibrated>,
 ) -> anyhow::Result<()> {
     let calibrated = result.as_ref().ok();
-    let warnings = calibrated.map_or(Vec::new(), |calibrated| calibrated.calibration.warnings.clone());
+    let found = calibrated.into_iter().flat_map(|calibrated| &calibrated.calibration.warnings);
+    let warnings = source.warnings().iter().chain(found).cloned().collect();
     let Some(heading) = outputs::heading(input, result, warnings) else { return Ok(()) };
     let calibration = calibrated.map(|calibrated| &calibrated.calibration);
-    let rig_line = calibration
-        .map(|calibration| printed::pose_toml(&calibration.parent_from_camera))
+    let rig_line = calibrated
+        .map(|calibrated| printed::pose_toml(&calibrated.rig_pose))
         .map(|pose| format!("parent_from_camera = {pose}"));
     let report = HandEyeReport {
         heading: &heading,
-        setup: file.setup,
+        setup: source.setup(),
         samples: &samples.used,
         unused: &samples.unused,
         calibration,
@@ -151,32 +173,53 @@ fn write_report(
 }
 
 impl Args {
-    fn calibrate(&self, file: &SamplesFile, samples: &Samples) -> anyhow::Result<Calibrated> {
-        file.check_detected(samples)?;
-        let symmetries: Vec<Transform> = file.target.as_ref().map(TargetSpec::symmetry).unwrap_or_default();
+    /// Reads the samples file, or the images of a recording or rig. `output` gets the calibration that devices report.
+    fn source(&self, keeps_photos: bool, output: Option<&mut RigOutput>) -> anyhow::Result<Source> {
+        let options = ScanOptions { keeps_photos, is_hidden: self.json };
+        let scan = self.rig.read(&self.input, self.target.as_ref(), options, output)?;
+        let has = |what: &str, flag: &str| BadArgument(format!("{flag}: {}; remove the flag", what));
+        match (scan, &self.target) {
+            (Some(_), _) if self.urdf.is_some() => {
+                Err(has("the rig file names the robot description", "--urdf").into())
+            }
+            (Some(scan), Some(target)) => Ok(Source::Scan { scan: Box::new(scan), target: target.clone() }),
+            (None, Some(_)) => Err(has("the samples file contains the target", "--target").into()),
+            (_, None) if self.with_joints && self.urdf.is_none() => {
+                Err(BadArgument("--with-joints: with samples in JSON, --urdf and --tip are needed, too".into()).into())
+            }
+            (_, None) => Ok(Source::File(SamplesFile::read(&self.input)?)),
+        }
+    }
+
+    fn calibrate(&self, source: &Source, samples: &Samples) -> anyhow::Result<Calibrated> {
+        source.check(samples)?;
+        let symmetries: Vec<Transform> = source.target().map(TargetSpec::symmetry).unwrap_or_default();
         let chain = self.chain()?;
-        let intrinsics = match (&file.intrinsics, samples.size_px) {
-            (Some(lens), Some(size_px)) => Some(lens.intrinsics(size_px)?),
-            _ => None,
-        };
-        let input = HandEyeInput {
-            setup: file.setup,
+        let intrinsics = source.intrinsics(samples.size_px)?;
+        let mut input = HandEyeInput {
+            setup: source.setup(),
             samples: samples.used.clone(),
             intrinsics: intrinsics.clone(),
             board_symmetries: &symmetries,
-            chain: chain.as_ref(),
+            chain: chain.as_ref().or(source.chain()),
             options: HandEyeOptions {
                 estimate_intrinsics: self.with_intrinsics,
                 estimate_joint_offsets: self.with_joints,
                 ..HandEyeOptions::default()
             },
         };
-        let calibration = calibrate_hand_eye(&input)?;
-        let next_poses = match &file.target {
+        let mut calibration = calibrate_hand_eye(&input)?;
+        if let Source::Scan { scan, .. } = source {
+            // The correction for a rolling shutter depends on the pose of the camera.
+            input.samples = scan.samples(Some(&calibration.parent_from_camera)).0;
+            calibration = calibrate_hand_eye(&input)?;
+        }
+        let next_poses = match source.target() {
             Some(target) => suggest_next_poses(&input, &calibration, &next_pose_options(target)),
             None => Vec::new(),
         };
-        Ok(Calibrated { calibration, next_poses, intrinsics })
+        let rig_pose = source.rig_pose(&calibration.parent_from_camera);
+        Ok(Calibrated { calibration, next_poses, intrinsics, rig_pose })
     }
 
     fn chain(&self) -> anyhow::Result<Option<Chain>> {

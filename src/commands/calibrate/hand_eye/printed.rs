@@ -4,7 +4,7 @@ use super::super::lens::LensFile;
 use super::super::{matrix_of, print_matrix};
 use crate::print;
 use calibration::hand_eye::{HandEyeCalibration, NextPose, SampleStatus, Setup};
-use kinematics::{Transform, transform};
+use kinematics::Transform;
 use serde::Serialize;
 use session::calibration_report::Unused;
 
@@ -157,12 +157,8 @@ pub(super) fn pose_toml(pose: &Transform) -> String {
     format!("{{ xyz_m = [{xyz_m}], quat_xyzw = [{quat_xyzw}] }}")
 }
 
-/// The transform of a printed matrix.
-fn transform_of(matrix: &Matrix) -> anyhow::Result<Transform> {
-    Ok(transform::from_rows(&std::array::from_fn(|ix| matrix[ix / 4][ix % 4]))?)
-}
-
-pub(super) fn describe(printed: &Printed) -> anyhow::Result<()> {
+/// Prints the result. `rig_pose`: `parent_from_camera` for the rig file.
+pub(super) fn describe(printed: &Printed, rig_pose: Option<&Transform>) -> anyhow::Result<()> {
     let matrices = [
         ("flange_from_camera", printed.flange_from_camera),
         ("base_from_camera", printed.base_from_camera),
@@ -174,8 +170,8 @@ pub(super) fn describe(printed: &Printed) -> anyhow::Result<()> {
         print::line(format!("{name}, row by row (meters):"))?;
         print_matrix(&matrix)?;
     }
-    if let Some(Some(matrix)) = printed.flange_from_camera.or(printed.base_from_camera) {
-        print::line(format!("rig file:\nparent_from_camera = {}", pose_toml(&transform_of(&matrix)?)))?;
+    if let Some(pose) = rig_pose {
+        print::line(format!("rig file:\nparent_from_camera = {}", pose_toml(pose)))?;
     }
     if let Some(intrinsics) = &printed.intrinsics {
         print::line(format!("intrinsics = {}", intrinsics.to_toml()))?;

@@ -66,6 +66,9 @@ impl SamplesFile {
         };
         let folder = path.parent().unwrap_or(Path::new(""));
         let samples = file.objects("samples", &SAMPLE_KEYS)?;
+        if samples.is_empty() {
+            return Err(file.invalid("samples", "the list is empty; add 12 or more robot poses with their images"));
+        }
         let read = Self {
             path: path.to_owned(),
             intrinsics: intrinsics.map(|lens| LensFile::read(&lens)).transpose()?,
@@ -104,7 +107,7 @@ impl SamplesFile {
             _ => Vec::new(),
         };
         let mut samples =
-            Samples { unused: images::unused(&detected), photos: images::photos(&detected), ..Samples::default() };
+            Samples { unused: images::unused(&detected), photos: images::photos(&files), ..Samples::default() };
         let mut detected = detected.into_iter();
         for (ix, entry) in self.entries.iter().enumerate() {
             let (name, board) = match &entry.board {
