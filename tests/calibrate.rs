@@ -275,6 +275,7 @@ fn bad_input_is_named_and_has_its_own_exit_code() {
     changed("missing.json", "base_from_flange", Value::Null);
     changed("key.json", "base_to_flange", json!(1));
     changed("both.json", "image", json!("a.png"));
+    write("empty.json", "{\"samples\": []}");
     write("syntax.json", "{\"samples\": [");
     write("table.csv", "1,2,3\n");
     let images = |name| vec!["intrinsics", name, "--target", TARGET];
@@ -289,6 +290,7 @@ fn bad_input_is_named_and_has_its_own_exit_code() {
         (hand_eye("missing.json"), "samples[1].base_from_flange: missing"),
         (hand_eye("key.json"), "samples[1]: unknown key \"base_to_flange\"; did you mean \"base_from_flange\"?"),
         (hand_eye("both.json"), "samples[1].image: "),
+        (hand_eye("empty.json"), "empty.json: samples: the list is empty"),
         (vec!["time-offset", "absent.csv", "table.csv"], "absent.csv"),
         (vec!["time-offset", "table.csv", "table.csv"], "line 1: 3 numbers, expected 8"),
         (vec!["scene", "absent"], "absent does not exist"),

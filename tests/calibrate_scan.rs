@@ -54,8 +54,11 @@ fn lens_and_hand_eye_of_a_moving_arm_are_found_from_a_printed_target() {
     });
     let output = fieldrig(folder, &["record", "rig.toml", "--sim", "--out", "scan.mcap"]);
     assert!(output.status.success(), "{}", stderr(&output));
-    let output = fieldrig(folder, &["calibrate", "intrinsics", "scan.mcap", "--target", TARGET, "--json"]);
+    let files = ["--write-rig", "calibrated.toml", "--report", "lens.html"];
+    let args = ["calibrate", "intrinsics", "scan.mcap", "--target", TARGET, "--json"];
+    let output = fieldrig(folder, &[&args[..], &files].concat());
     assert!(output.status.success(), "{}", stderr(&output));
+    assert!(is_report_with_photo(folder, "lens.html"));
     let lens = json_of(&output);
     for (truth, (key, axis), name) in [
         (614.6, ("focal_px", 0), "fx"),
@@ -68,18 +71,31 @@ fn lens_and_hand_eye_of_a_moving_arm_are_found_from_a_printed_target() {
         assert!(error.abs() < MAX_SIGMAS * sigma && sigma < 0.5, "{name}: off by {error} px, stated {sigma} px");
     }
 
-    write_rig(folder, "calibrated.toml", |rig| {
-        let mut intrinsics = toml::Table::new();
-        for key in ["focal_px", "principal_px", "distortion"] {
-            intrinsics.insert(key.into(), numbers(&lens[key]).into());
-        }
-        intrinsics.insert("lens".into(), lens["model"].as_str().expect("a name").into());
-        rig["camera"]["wrist"]["intrinsics"] = intrinsics.into();
-    });
-    let args = ["calibrate", "hand-eye", "calibrated.toml", "--sim", "--seconds", "24.5", "--target", TARGET, "--json"];
-    let output = fieldrig(folder, &args);
-    assert!(output.status.success(), "{}", stderr(&output));
-    let result = json_of(&output);
+    // From the recording and from the simulated devices; the result of the latter is written.
+    let files = ["--report", "hand-eye.html", "--write-rig", "result.toml"];
+    for input in [&["scan.mcap", "--rig", "calibrated.toml"][..], &["calibrated.toml", "--sim", "--seconds", "24.5"]] {
+        let args = [&["calibrate", "hand-eye"], input, &["--target", TARGET, "--json"], &files].concat();
+        let output = fieldrig(folder, &args);
+        assert!(output.status.success(), "{input:?}: {}", stderr(&output));
+        assert!(is_report_with_photo(folder, "hand-eye.html"), "{input:?}");
+        check_pose(&json_of(&output));
+    }
+    let text = std::fs::read_to_string(folder.join("result.toml")).expect("a rig file");
+    let rig: toml::Table = text.parse().expect("TOML");
+    let camera = &rig["camera"]["wrist"];
+    let value = |key: &str, list: &str, ix: usize| camera[key][list][ix].as_float().expect("a number");
+    let (focal_px, x_m) = (value("intrinsics", "focal_px", 0), value("parent_from_camera", "xyz_m", 0));
+    assert!((focal_px - 614.6).abs() < 1.0 && (x_m - 0.06).abs() < 2e-4, "{text}");
+    assert!(folder.join("result.toml.old").exists());
+}
+
+/// Whether a report contains at least one image.
+fn is_report_with_photo(folder: &Path, file: &str) -> bool {
+    std::fs::read_to_string(folder.join(file)).expect("a report").contains("data:image/jpeg")
+}
+
+fn check_pose(result: &Value) {
+    const MAX_SIGMAS: f64 = 4.0;
     let found = numbers(&result["flange_from_camera"]).try_into().expect("16 numbers");
     let error = true_pose().inverse() * transform::from_rows(&found).expect("a rigid transform");
     let errors_mm = error.translation.vector * 1e3;
@@ -102,8 +118,14 @@ fn unusable_scans_are_rejected_with_the_reason() {
     for (args, expected) in [
         (&["bad.toml", "--sim", "--target", TARGET][..], "sim.target.board"),
         (&["rig.toml", "--sim"], "--target is missing"),
+        (&["samples.json", "--with-joints"], "--urdf and --tip are needed"),
+        (&["rig.toml", "--sim", "--target", TARGET, "--urdf", "a.urdf", "--tip", "b"], "names the robot description"),
         (&["rig.toml", "--sim", "--target", TARGET, "--camera", "front"], "it has wrist"),
         (&["samples.json", "--sim", "--target", TARGET], "--sim and --seconds need a rig file"),
+        (&["rig.toml", "--sim", "--target", TARGET, "--rig", "rig.toml"], "is a rig file, which is used; remove --rig"),
+        (&["rig.toml", "--sim", "--target", TARGET, "--write-rig", "absent/rig.toml"], "in an existing folder"),
+        (&["samples.json", "--write-rig", "new.toml"], "name the one to change with --rig"),
+        (&["samples.json", "--rig", "rig.toml"], "add --write-rig"),
     ] {
         let output = fieldrig(folder, &[&["calibrate", "hand-eye"], args].concat());
         let printed = stderr(&output);
@@ -136,8 +158,13 @@ fn scene_calibration_reports_the_pose_between_two_cameras() {
         camera("side", [-0.06, 0.04, 0.045], right_rotation, SIDE, wrong_rotation),
     ];
     std::fs::write(folder.join("rig.toml"), rig.concat()).expect("the disk has space");
-    let output = fieldrig(folder, &["calibrate", "scene", "rig.toml", "--sim", "--seconds", "10", "--json"]);
+    let args = ["calibrate", "scene", "rig.toml", "--sim", "--seconds", "10", "--json", "--report", "scene.html"];
+    let output = fieldrig(folder, &args);
     assert!(output.status.success(), "{}", stderr(&output));
+    let page = std::fs::read_to_string(folder.join("scene.html")).expect("a report");
+    for words in ["Poses between cameras", "wrist in side", "side in its parent"] {
+        assert!(page.contains(words), "{words} is missing");
+    }
     let cameras = &json_of(&output)["cameras"];
     assert!(cameras["side"]["relative"].is_null(), "{cameras}");
     let relative = &cameras["wrist"]["relative"];
