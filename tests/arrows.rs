@@ -10,7 +10,7 @@ const ALLOWED: [(&str, &[&str]); 12] = [
     ("keyframe", &["kinematics"]),
     ("calibration", &["keyframe", "kinematics"]),
     ("drivers", &["kinematics"]),
-    ("sim", &["drivers", "kinematics"]),
+    ("sim", &["drivers", "kinematics", "targets"]),
     ("targets", &["kinematics"]),
     ("capture", &["calibration", "drivers", "keyframe", "kinematics", "sim"]),
     ("trainer", &["calibration", "keyframe", "kinematics"]),

@@ -135,6 +135,23 @@ fn lens_and_hand_eye_are_found_from_images() {
     assert!(mm < 1.0 && degrees < 0.1, "{mm} mm, {degrees} degrees: {result}");
     assert!(result["refused"].is_null() && result["sigma_mm"].as_array().is_some_and(|sigma| sigma.len() == 3));
 
+    // Reports are complete, and names from files are escaped.
+    std::fs::rename(images.join("3.png"), images.join("<i>3.png")).expect("a file");
+    let args = ["calibrate", "intrinsics", "images", "--target", TARGET, "--report", "lens.html"];
+    assert_eq!(fieldrig(folder.path(), &args).status.code(), Some(DONE));
+    let page = report(folder.path(), "lens.html");
+    for words in ["Accepted", "focal length x", "Projection uncertainty", "magnified", "&lt;i&gt;3.png", "broken.jpg"] {
+        assert!(page.contains(words), "{words} is missing");
+    }
+    assert_eq!(page.matches("data:image/jpeg;base64,").count(), 2, "the worst and the median image");
+    std::fs::rename(images.join("<i>3.png"), images.join("3.png")).expect("a file");
+    let args = ["calibrate", "hand-eye", "samples.json", "--report", "hand-eye.html"];
+    assert_eq!(fieldrig(folder.path(), &args).status.code(), Some(DONE));
+    let page = report(folder.path(), "hand-eye.html");
+    for words in ["Accepted", "position of the camera in the flange", "Rotations of the flange", "images/11.png"] {
+        assert!(page.contains(words), "{words} is missing");
+    }
+
     // Intrinsics of another resolution are rejected.
     let mut other = file;
     other["intrinsics"]["size_px"] = json!([960, 720]);
@@ -148,6 +165,141 @@ fn lens_and_hand_eye_are_found_from_images() {
         fieldrig(folder.path(), &["calibrate", "intrinsics", "images", "--target", "charuco:5x7:34mm:26mm:4X4_50"]);
     assert_eq!(output.status.code(), Some(INSUFFICIENT_DATA));
     assert!(stderr(&output).contains("5X5"), "{}", stderr(&output));
+
+    // Markers of another size are measured.
+    let output =
+        fieldrig(folder.path(), &["calibrate", "intrinsics", "images", "--target", "charuco:5x7:34mm:20mm:5X5_100"]);
+    assert_eq!(output.status.code(), Some(INSUFFICIENT_DATA));
+    assert!(stderr(&output).contains("the markers are about 0.7"), "{}", stderr(&output));
+}
+
+/// A report. It must not load anything.
+fn report(folder: &Path, name: &str) -> String {
+    let page = std::fs::read_to_string(folder.join(name)).expect("a report");
+    assert!(page.starts_with("<!doctype html>") && page.trim_end().ends_with("</html>"));
+    for source in ["<script", "<link", "src=\"http", "href=\"http", "url("] {
+        assert!(!page.contains(source), "{name} contains {source}");
+    }
+    // Encoded pictures may contain any letters.
+    let without_picture = |part: &str| part.split_once('"').map_or(String::new(), |(_, rest)| rest.to_owned());
+    let mut parts = page.split("base64,");
+    let text = parts.next().unwrap_or_default().to_owned() + &parts.map(without_picture).collect::<String>();
+    assert!(!text.contains("NaN") && !text.contains("<i>"), "{name}");
+    page
+}
+
+#[test]
+fn results_are_written_into_a_rig_file() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let images = folder.path().join("images");
+    std::fs::create_dir(&images).expect("a folder");
+    write_images(&images);
+    let rigs = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs");
+    let text = std::fs::read_to_string(rigs.join("static-arm.toml")).expect("a rig file");
+    let urdf = rigs.join("robots/panda.urdf").display().to_string();
+    let rig = text.replace("robots/panda.urdf", &urdf);
+    std::fs::write(folder.path().join("other-size.toml"), &rig).expect("a file");
+    let rig = rig.replace("size_px = [640, 480]", "size_px = [480, 360]");
+    std::fs::write(folder.path().join("rig.toml"), &rig).expect("a file");
+    let run = |args: &[&str]| {
+        let output = fieldrig(folder.path(), &[&["calibrate"], args].concat());
+        (output.status.code(), stderr(&output))
+    };
+    let lens = ["intrinsics", "images", "--target", TARGET];
+    let written = |name: &str| {
+        let text = std::fs::read_to_string(folder.path().join(name)).expect("a rig file");
+        text.parse::<toml::Table>().expect("a rig file")["camera"]["wrist"].clone()
+    };
+
+    let (code, error) =
+        run(&[&lens[..], &["--rig", "rig.toml", "--camera", "wrist", "--write-rig", "new.toml"]].concat());
+    assert_eq!(code, Some(DONE), "{error}");
+    let focal_px = written("new.toml")["intrinsics"]["focal_px"][0].as_float().expect("a number");
+    assert!((focal_px - camera().focal_px[0]).abs() < 2.0, "{focal_px}");
+
+    let poses = robot_poses().into_iter().zip(board_poses());
+    let pair = |(robot, board): (Transform, Transform)| json!({"base_from_flange": rows(&robot), "camera_from_board": rows(&board)});
+    let samples: Vec<Value> = poses.map(pair).collect();
+    std::fs::write(folder.path().join("samples.json"), json!({"samples": samples}).to_string()).expect("a file");
+    let hand_eye = ["hand-eye", "samples.json", "--rig", "new.toml", "--camera", "wrist", "--write-rig", "new.toml"];
+    let (code, error) = run(&hand_eye);
+    assert_eq!(code, Some(DONE), "{error}");
+    let camera = written("new.toml");
+    let x_m = camera["parent_from_camera"]["xyz_m"][0].as_float().expect("a number");
+    assert!((x_m - flange_from_camera().translation.x).abs() < 1e-6, "{x_m}");
+    assert_eq!(camera["intrinsics"]["focal_px"][0].as_float(), Some(focal_px), "the intrinsics are kept");
+    assert!(folder.path().join("new.toml.old").exists());
+
+    // Nothing is written if something is wrong.
+    let rejected = |args: &[&str], expected: i32, words: &str| {
+        let (code, error) = run(args);
+        assert!(code == Some(expected) && error.contains(words), "{code:?} {error}");
+        assert!(!folder.path().join("not.toml").exists());
+    };
+    let target = ["--write-rig", "not.toml"];
+    rejected(
+        &[&lens[..], &["--rig", "rig.toml", "--camera", "wirst"], &target].concat(),
+        BAD_ARGUMENTS,
+        "it has wrist",
+    );
+    rejected(
+        &[&lens[..], &["--rig", "other-size.toml", "--camera", "wrist"], &target].concat(),
+        BAD_ARGUMENTS,
+        "640x480",
+    );
+    rejected(&[&lens[..], &target].concat(), BAD_ARGUMENTS, "--rig");
+    std::fs::write(folder.path().join("few.json"), json!({"samples": samples[..2]}).to_string()).expect("a file");
+    let few = ["hand-eye", "few.json", "--rig", "rig.toml", "--camera", "wrist"];
+    rejected(&[&few[..], &target].concat(), INSUFFICIENT_DATA, "at least 3");
+    let to_hand = json!({"samples": samples, "setup": "eye-to-hand"});
+    std::fs::write(folder.path().join("to-hand.json"), to_hand.to_string()).expect("a file");
+    let to_hand = ["hand-eye", "to-hand.json", "--rig", "rig.toml", "--camera", "wrist"];
+    rejected(&[&to_hand[..], &target].concat(), BAD_ARGUMENTS, "parent in the rig file is flange");
+}
+
+#[test]
+fn bad_input_is_named_and_has_its_own_exit_code() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let write = |name: &str, text: &str| std::fs::write(folder.path().join(name), text).expect("a file");
+    std::fs::create_dir(folder.path().join("empty")).expect("a folder");
+    std::fs::create_dir(folder.path().join("unreadable")).expect("a folder");
+    write("unreadable/a.png", "not an image");
+    let sample =
+        json!({"base_from_flange": rows(&Transform::identity()), "camera_from_board": rows(&Transform::identity())});
+    let changed = |name: &str, key: &str, value: Value| {
+        let mut bad = sample.clone();
+        bad[key] = value;
+        write(name, &json!({"samples": [sample, bad]}).to_string());
+    };
+    changed("matrix.json", "base_from_flange", json!([[1, 0, 0, 0]]));
+    changed("missing.json", "base_from_flange", Value::Null);
+    changed("key.json", "base_to_flange", json!(1));
+    changed("both.json", "image", json!("a.png"));
+    write("empty.json", "{\"samples\": []}");
+    write("syntax.json", "{\"samples\": [");
+    write("table.csv", "1,2,3\n");
+    let images = |name| vec!["intrinsics", name, "--target", TARGET];
+    let hand_eye = |name| vec!["hand-eye", name];
+    for (args, words) in [
+        (images("absent"), "absent"),
+        (images("empty"), "no .jpg, .jpeg or .png image"),
+        (images("unreadable"), "none of 1 images can be read; a.png"),
+        (hand_eye("absent.json"), "absent.json"),
+        (hand_eye("syntax.json"), "syntax.json"),
+        (hand_eye("matrix.json"), "matrix.json: samples[1].base_from_flange: must be a matrix"),
+        (hand_eye("missing.json"), "samples[1].base_from_flange: missing"),
+        (hand_eye("key.json"), "samples[1]: unknown key \"base_to_flange\"; did you mean \"base_from_flange\"?"),
+        (hand_eye("both.json"), "samples[1].image: "),
+        (hand_eye("empty.json"), "empty.json: samples: the list is empty"),
+        (vec!["time-offset", "absent.csv", "table.csv"], "absent.csv"),
+        (vec!["time-offset", "table.csv", "table.csv"], "line 1: 3 numbers, expected 8"),
+        (vec!["scene", "absent"], "absent does not exist"),
+        (vec!["hand-eye", "key.json", "--report", "page.pdf"], "extension .html"),
+    ] {
+        let output = fieldrig(folder.path(), &[vec!["calibrate"], args.clone()].concat());
+        let error = stderr(&output);
+        assert!(output.status.code() == Some(BAD_ARGUMENTS) && error.contains(words), "{args:?}: {error}");
+    }
 }
 
 #[test]
@@ -156,7 +308,8 @@ fn weak_excitation_and_mistakes_are_refused() {
     let run = |samples: Vec<Value>| {
         let file = json!({"samples": samples});
         std::fs::write(folder.path().join("samples.json"), file.to_string()).expect("a file");
-        let output = fieldrig(folder.path(), &["calibrate", "hand-eye", "samples.json", "--json"]);
+        let args = ["calibrate", "hand-eye", "samples.json", "--json", "--report", "page.html"];
+        let output = fieldrig(folder.path(), &args);
         (output.status.code(), json_of(&output))
     };
     let both = || robot_poses().into_iter().zip(board_poses());
@@ -189,6 +342,16 @@ fn weak_excitation_and_mistakes_are_refused() {
     let (code, result) = run(about_z.collect());
     assert_eq!(code, Some(INSUFFICIENT_DATA), "{result}");
     assert!(result["refused"].as_str().is_some_and(|reason| reason.contains("z axis")), "{result}");
+    let page = report(folder.path(), "page.html");
+    for words in ["Refused", "hardly any rotation", "Rotations of the flange"] {
+        assert!(page.contains(words), "{words} is missing");
+    }
+
+    // Each image is paired with the robot pose of the sample before it.
+    let shifted = robot_poses().into_iter().zip(board_poses().into_iter().skip(1)).map(pair).collect();
+    let (code, result) = run(shifted);
+    assert_eq!(code, Some(INSUFFICIENT_DATA), "{result}");
+    assert!(result["refused"].as_str().is_some_and(|reason| reason.contains("off by one")), "{result}");
 }
 
 #[test]
@@ -215,9 +378,27 @@ fn time_offset_of_two_streams_is_found() {
     assert_eq!(output.status.code(), Some(DONE), "{}", stderr(&output));
     let offset_secs = json_of(&output)["offset_secs"].as_f64().expect("a number");
     assert!((offset_secs - 42.75).abs() < 1e-3, "{offset_secs}");
-    let output = fieldrig(folder.path(), &["calibrate", "time-offset", "a.csv", "still.csv", "--json"]);
+    let args = ["calibrate", "time-offset", "a.csv", "b.csv", "--report", "found.html"];
+    assert_eq!(fieldrig(folder.path(), &args).status.code(), Some(DONE));
+    let page = report(folder.path(), "found.html");
+    for words in ["Accepted", "Highest correlation", "After: both streams on the clock of A", "RMS "] {
+        assert!(page.contains(words), "{words} is missing");
+    }
+    let args = ["calibrate", "time-offset", "a.csv", "still.csv", "--json", "--report", "refused.html"];
+    let output = fieldrig(folder.path(), &args);
     assert_eq!(output.status.code(), Some(INSUFFICIENT_DATA), "{}", stderr(&output));
     assert!(json_of(&output)["refused"].is_string());
+    assert!(report(folder.path(), "refused.html").contains("body B hardly rotates"));
+    // Stamps in milliseconds.
+    let text = std::fs::read_to_string(folder.path().join("b.csv")).expect("a file");
+    let millis = text.lines().skip(1).map(|line| {
+        let (secs, rest) = line.split_once(',').expect("columns");
+        format!("{},{rest}\n", 1e3 * secs.parse::<f64>().expect("a number"))
+    });
+    std::fs::write(folder.path().join("millis.csv"), millis.collect::<String>()).expect("a file");
+    let output = fieldrig(folder.path(), &["calibrate", "time-offset", "a.csv", "millis.csv"]);
+    assert_eq!(output.status.code(), Some(INSUFFICIENT_DATA), "{}", stderr(&output));
+    assert!(stderr(&output).contains("stream B are probably in milliseconds"), "{}", stderr(&output));
 }
 
 #[test]

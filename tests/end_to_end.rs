@@ -595,7 +595,6 @@ fn without_depth_the_hand_eye_calibration_is_estimated_from_color() {
     let folder = folder.path();
     record_with_wrong_hand_eye(folder, N_IMAGES, |wrist| {
         wrist.remove("depth");
-        wrist.insert("readout_micros".into(), 0.into()); // The ideal simulation exposes all rows at once.
     });
     std::fs::create_dir(folder.join("found")).expect("the disk has space");
     let common = ["--refine", "extrinsics", "--steps", "400", "--max-splats", "2000", "--json"];

@@ -2,7 +2,7 @@
 //!
 //! [`curve`], [`budget`], [`ablation`] and [`stability`] train models. They save each finished run to a file, so that a
 //! bench restarted in the same folder does not repeat it. [`kernels`] and [`field`] measure training speed, [`stamps`]
-//! the errors of image stamps, [`live`] a live run with viewers, and [`memory`] the memory of a long run. The results
+//! the errors of image stamps, [`calibration`] the accuracy of calibration, [`live`] a live run with viewers, and [`memory`] the memory of a long run. The results
 //! are [`Findings`]: JSON with every number, charts, and a page.
 //!
 //! The caller opens the GPU, requests stops and receives reports ([`Host`], [`BenchObserver`]).
@@ -30,6 +30,7 @@
 
 pub mod ablation;
 pub mod budget;
+pub mod calibration;
 pub mod curve;
 mod disturb;
 pub mod field;

@@ -52,7 +52,7 @@ pub use intrinsics::{
 };
 pub use params::ParamSet;
 pub use registration::{
-    Alignment, CameraMovement, Estimate, MOVEMENT_WINDOW, MovementDetector, PoseEstimate, ScalarEstimate,
-    StationCorrection, Unobservable, align, candidates, register_station,
+    Alignment, CameraMovement, Estimate, ExtrinsicsCovariance, MOVEMENT_WINDOW, MovementDetector, PoseEstimate,
+    PoseSigmas, ScalarEstimate, StationCorrection, Unobservable, align, candidates, register_station,
 };
 pub use trial::{CameraRefinement, Candidate, MIN_VALIDATION_IMAGES, Trial, TrialReport};

@@ -2,6 +2,7 @@
 
 use crate::ParamSet;
 use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
 
 /// Minimum number of validation images for a trial.
 pub const MIN_VALIDATION_IMAGES: usize = 4;
@@ -140,6 +141,9 @@ pub struct Trial {
     pub n_images: usize,
     /// Whether the change is kept.
     pub kept: bool,
+    /// Mean gain over the validation keyframes of each camera, dB. Empty if it was not evaluated.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub gain_by_camera_db: BTreeMap<String, f64>,
 }
 
 impl Trial {
@@ -159,7 +163,19 @@ impl Trial {
             Candidate::Doubled { .. } => gain_db - standard_error_db > min_db,
             Candidate::Cameras(_) => gain_db > f64::max(min_db, MIN_STANDARD_ERRORS * standard_error_db),
         };
-        Self { candidate, gain_db, standard_error_db, n_images, kept: n_images > 1 && is_significant }
+        let kept = n_images > 1 && is_significant;
+        Self { candidate, gain_db, standard_error_db, n_images, kept, gain_by_camera_db: BTreeMap::new() }
+    }
+
+    /// Adds the mean gain of each camera from the gains of single images, dB.
+    #[must_use]
+    pub fn with_cameras<'a>(self, gains_db: impl Iterator<Item = (&'a str, f64)>) -> Self {
+        let mut by_camera: BTreeMap<String, Vec<f64>> = BTreeMap::new();
+        for (camera, gain_db) in gains_db {
+            by_camera.entry(camera.to_owned()).or_default().push(gain_db);
+        }
+        let means = by_camera.into_iter().map(|(camera, gains_db)| (camera, MeanGain::of(&gains_db).mean));
+        Self { gain_by_camera_db: means.collect(), ..self }
     }
 
     /// Rejects the change if there are fewer than [`MIN_VALIDATION_IMAGES`].

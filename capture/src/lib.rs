@@ -28,6 +28,7 @@
 //! # Ok::<(), capture::Error>(())
 //! ```
 
+mod calibration_images;
 pub mod config;
 pub mod dataset;
 pub mod doctor;
@@ -43,6 +44,7 @@ mod stop;
 #[path = "../../tests/common/test_data.rs"]
 mod test_data;
 
+pub use calibration_images::{ArmDuringImage, CalibrationImage, CalibrationImages, calibration_images};
 pub use config::{ConfigError, Override, Rig};
 pub use error::{Error, Result};
 pub use feed::{Feed, FeedItem, ImageObserver, Input, InputResult, InputTimes, ObservedImage, ObservedPixels};

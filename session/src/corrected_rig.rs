@@ -3,7 +3,8 @@
 use crate::error::Context;
 use crate::{Error, run_folder};
 use calibration::{Alignment, CameraCorrection, Estimate};
-use capture::config::{Camera, Rig, TimeOffset};
+use capture::config::{Camera, Parent, Rig, TimeOffset};
+use keyframe::listed;
 use kinematics::{Chain, Intrinsics, Stamp, Transform};
 use nalgebra::{Translation3, UnitQuaternion, Vector3};
 use std::collections::BTreeMap;
@@ -60,6 +61,80 @@ pub fn corrected(
         }
     }
     Ok(rig)
+}
+
+/// A camera of a rig.
+///
+/// # Errors
+/// [`Error::BadInput`] with the names of all cameras if there is none of this name.
+pub fn camera<'a>(rig: &'a Rig, name: &str) -> Result<&'a Camera, Error> {
+    rig.cameras.iter().find(|camera| *camera.name == *name).ok_or_else(|| {
+        let names: Vec<&str> = rig.cameras.iter().map(|camera| &*camera.name).collect();
+        Error::BadInput(format!("--camera {name}: the rig file has no such camera; it has {}", listed(&names, "and")))
+    })
+}
+
+/// The rig with other intrinsics of a camera. Depth images with the same lens get them, too.
+///
+/// # Errors
+/// [`Error::BadInput`] if there is no such camera, or if its images have another size.
+pub fn with_intrinsics(rig: &Rig, name: &str, intrinsics: &Intrinsics) -> Result<Rig, Error> {
+    expect_size(camera(rig, name)?, intrinsics.size_px)?;
+    let mut rig = rig.clone();
+    for camera in rig.cameras.iter_mut().filter(|camera| *camera.name == *name) {
+        let before = std::mem::replace(&mut camera.intrinsics, intrinsics.clone());
+        camera.realsense.unknown.intrinsics = false;
+        if let Some(depth) = &mut camera.depth
+            && depth.intrinsics == before.resized(depth.intrinsics.size_px)
+        {
+            depth.intrinsics = intrinsics.resized(depth.intrinsics.size_px);
+        }
+    }
+    Ok(rig)
+}
+
+/// The rig with another pose of a camera. A pose in a fixed base is converted for a camera that is attached to the world.
+///
+/// # Errors
+/// [`Error::BadInput`] if there is no such camera, or if it is attached to another frame than `parent`.
+pub fn with_extrinsics(rig: &Rig, name: &str, parent: Parent, pose: &Transform) -> Result<Rig, Error> {
+    let given = camera(rig, name)?.parent;
+    let is_converted = (parent, given) == (Parent::Base, Parent::World) && !rig.has_moving_base();
+    let pose = if is_converted { &(rig.base.world_from_base * pose) } else { pose };
+    if given != parent && !is_converted {
+        return Err(Error::BadInput(format!(
+            "--camera {name}: its parent in the rig file is {}, but the calibrated pose is relative to the {}; change parent, or the setup of the calibration",
+            name_of(given),
+            name_of(parent)
+        )));
+    }
+    let mut rig = rig.clone();
+    let camera = rig.cameras.iter_mut().find(|camera| *camera.name == *name);
+    camera.expect("checked above").parent_from_camera = *pose;
+    Ok(rig)
+}
+
+/// Checks that calibrated images have the size of a camera's images.
+///
+/// # Errors
+/// [`Error::BadInput`] if not.
+pub fn expect_size(camera: &Camera, [width, height]: [u32; 2]) -> Result<(), Error> {
+    let [rig_width, rig_height] = camera.intrinsics.size_px;
+    if [width, height] == camera.intrinsics.size_px {
+        return Ok(());
+    }
+    Err(Error::BadInput(format!(
+        "--camera {}: its images have {rig_width}x{rig_height} pixels in the rig file, but the calibrated images have {width}x{height}; calibrate this resolution, or change size_px",
+        camera.name
+    )))
+}
+
+fn name_of(parent: Parent) -> &'static str {
+    match parent {
+        Parent::Flange => "flange",
+        Parent::Base => "base",
+        Parent::World => "world",
+    }
 }
 
 /// Checks that a rig file can be written to this path.
@@ -232,5 +307,28 @@ mod tests {
             check_target_file(&calibrated_rig, &file).unwrap_err().to_string().contains("another robot"),
             "the check before training rejects it, too"
         );
+    }
+
+    #[test]
+    fn intrinsics_and_extrinsics_are_replaced() {
+        let rig = bundled_rig();
+        let before = &rig.cameras[0];
+        let other = Intrinsics { focal_px: [700.0, 701.0], ..before.intrinsics.clone() };
+        let replaced = with_intrinsics(&rig, "wrist", &other).unwrap();
+        assert_eq!(replaced.cameras[0].intrinsics, other);
+        let depth = replaced.cameras[0].depth.as_ref().unwrap();
+        assert_eq!(depth.intrinsics, other.resized(depth.intrinsics.size_px), "depth uses the same lens");
+        let pose = Transform::translation(0.1, 0.2, 0.3);
+        let moved = with_extrinsics(&rig, "wrist", Parent::Flange, &pose).unwrap();
+        assert_eq!(moved.cameras[0].parent_from_camera, pose);
+        assert_eq!(moved.cameras[0].intrinsics, before.intrinsics);
+
+        let message = |result: Result<Rig, Error>| result.unwrap_err().to_string();
+        let unknown = message(with_intrinsics(&rig, "wirst", &other));
+        assert!(unknown.contains("wirst") && unknown.contains("wrist"), "{unknown}");
+        let small = Intrinsics { size_px: [320, 240], ..other };
+        assert!(message(with_intrinsics(&rig, "wrist", &small)).contains("320x240"));
+        let base = message(with_extrinsics(&rig, "wrist", Parent::Base, &pose));
+        assert!(base.contains("is flange") && base.contains("the base"), "{base}");
     }
 }

@@ -19,6 +19,7 @@
 //! # Ok::<(), session::Error>(())
 //! ```
 
+pub mod calibration_report;
 pub mod camera_list;
 pub mod camera_path;
 pub mod chart;
@@ -33,6 +34,7 @@ mod error;
 pub mod evaluate;
 pub mod evaluation_schedule;
 mod gpu_loss;
+mod inline_picture;
 mod ledger;
 mod live;
 pub mod methods;
@@ -74,7 +76,7 @@ pub use read_progress::{OnReadProgress, ReadProgress, ignore_progress};
 pub use recoveries::OpenGpu;
 pub use recovery::Recovery;
 pub use replay::Replay;
-pub use scene_calibration::{SCENE_PARAMS, SceneCalibration, calibrate_scene};
+pub use scene_calibration::{RelativePose, SCENE_PARAMS, SceneCalibration, calibrate_scene};
 pub use session::{EndingSession, Evaluators, FinishedModel, Limits, Session, TrainingOutcome, finish};
 pub use stored_keyframes::StoredKeyframes;
 pub use table::Table;

@@ -341,6 +341,15 @@ fn name_from_time(since_epoch: Duration) -> String {
     format!("{year:04}{month:02}{day:02}-{:02}{:02}{:02}", secs_of_day / 3600, secs_of_day / 60 % 60, secs_of_day % 60)
 }
 
+/// Date and time of day in UTC, for readers.
+pub(crate) fn utc_now() -> String {
+    #[expect(clippy::disallowed_methods, reason = "only shown; no time is measured")]
+    let secs = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_secs();
+    let (year, month, day) = date_from_days(secs / SECS_PER_DAY);
+    let minutes = secs % SECS_PER_DAY / 60;
+    format!("{year:04}-{month:02}-{day:02} {:02}:{:02} UTC", minutes / 60, minutes % 60)
+}
+
 /// Converts days since 1 January 1970 to year, month and day.
 fn date_from_days(mut days: u64) -> (u64, usize, u64) {
     let is_leap = |year: u64| year.is_multiple_of(4) && (!year.is_multiple_of(100) || year.is_multiple_of(400));

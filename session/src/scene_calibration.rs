@@ -3,9 +3,10 @@
 use crate::corrected_rig;
 use crate::training_options::{Refine, TrainingOptions};
 use crate::{Data, Error};
-use calibration::{Alignment, CameraRefinement, ParamSet};
+use calibration::{Alignment, CameraRefinement, ExtrinsicsCovariance, ParamSet, PoseSigmas};
 use capture::config::{Parent, Rig};
 use keyframe::{Keyframe, Split, counted};
+use kinematics::Transform;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
@@ -25,6 +26,42 @@ impl SceneCalibration {
     pub fn is_refused(&self, data: &Data) -> bool {
         data.keyframes.iter().all(|keyframe| self.refused.contains_key(&*keyframe.camera))
     }
+
+    /// Standard deviations of the pose of a camera in its parent frame, along and about the axes of the camera. `None` if
+    /// its extrinsics were not estimated.
+    pub fn sigmas(&self, camera: &str) -> Option<PoseSigmas> {
+        self.covariance(&[camera])?.of_camera(camera)
+    }
+
+    /// Pose of a camera in the frame of the first camera with the same parent, by name. `None` for that camera, and without
+    /// a rig.
+    pub fn relative(&self, camera: &str) -> Option<RelativePose> {
+        let cameras = &self.rig.as_ref()?.cameras;
+        let camera = cameras.iter().find(|other| *other.name == *camera)?;
+        let same_parent = cameras.iter().filter(|other| other.parent == camera.parent);
+        let first = same_parent.min_by_key(|other| &other.name).filter(|first| first.name != camera.name)?;
+        let first_from_camera = first.parent_from_camera.inverse() * camera.parent_from_camera;
+        let covariance = self.covariance(&[&first.name, &camera.name]);
+        let sigmas = covariance.and_then(|known| known.between(&first.name, &camera.name, &first_from_camera));
+        Some(RelativePose { first: first.name.to_string(), first_from_camera, sigmas })
+    }
+
+    /// The covariance, unless one of the cameras was refused.
+    fn covariance(&self, cameras: &[&str]) -> Option<&ExtrinsicsCovariance> {
+        let is_refused = cameras.iter().any(|camera| self.refused.contains_key(*camera));
+        self.alignment.extrinsics_covariance.as_ref().filter(|_| !is_refused)
+    }
+}
+
+/// Pose of a camera in the frame of another one with the same parent.
+#[derive(Clone, Debug)]
+pub struct RelativePose {
+    /// Name of the other camera.
+    pub first: String,
+    /// The pose.
+    pub first_from_camera: Transform,
+    /// Standard deviations along and about the axes of the camera. `None` if they are unknown.
+    pub sigmas: Option<PoseSigmas>,
 }
 
 /// The parameters that [`calibrate_scene`] can estimate, and `auto`.

@@ -3,6 +3,7 @@
 use crate::Error;
 use kinematics::{Intrinsics, Lens, Transform};
 use nalgebra::{Translation3, UnitQuaternion, Vector3};
+use targets::TargetSpec;
 
 /// A simulated rig.
 #[derive(Clone, Debug, PartialEq)]
@@ -42,6 +43,26 @@ pub struct Config {
     pub base: BaseConfig,
     /// Brightness of all lamps while the arm's camera is inside the cabinet, relative to outside; 1 has no effect.
     pub light_inside_frac: f64,
+    /// Printed calibration targets in the scene; names are unique.
+    pub targets: Vec<TargetConfig>,
+}
+
+/// A calibration target, printed on a flat plate.
+#[derive(Clone, Debug, PartialEq)]
+pub struct TargetConfig {
+    /// Name in the rig file.
+    pub name: String,
+    /// Specification, such as `charuco:5x7:34mm:26mm:5X5_100`.
+    pub spec: String,
+    /// Pose of the board frame: x points right on the print, y down, z into the plate.
+    pub world_from_board: Transform,
+}
+
+impl TargetConfig {
+    /// The parsed specification.
+    pub(crate) fn target(&self) -> Result<TargetSpec, Error> {
+        self.spec.parse().map_err(|source| Error::Target { target: self.name.clone(), source })
+    }
 }
 
 /// Poses reported by a scene's moving base.
@@ -343,6 +364,7 @@ impl Default for Config {
             scanners: Vec::new(),
             base: BaseConfig::default(),
             light_inside_frac: 1.0,
+            targets: Vec::new(),
         }
     }
 }
@@ -392,6 +414,10 @@ impl Config {
             }
             scanner.check()?;
         }
+        for target in &self.targets {
+            target.target()?;
+            check_pose(&target.name, "world_from_board", &target.world_from_board)?;
+        }
         Ok(())
     }
 }
@@ -416,9 +442,7 @@ impl ScannerConfig {
         check(of, "max_m", self.max_m, self.min_m, 1000.0)?;
         check(of, "noise_sigma_m", self.noise_sigma_m, 0.0, 1.0)?;
         check(of, "dropped_frac", self.dropped_frac, 0.0, 0.9)?;
-        let pose =
-            self.base_from_scanner.translation.vector.iter().chain(self.base_from_scanner.rotation.coords.iter());
-        pose.into_iter().try_for_each(|number| check(of, "base_from_scanner", *number, -100.0, 100.0))
+        check_pose(of, "base_from_scanner", &self.base_from_scanner)
     }
 }
 
@@ -429,11 +453,7 @@ impl CameraConfig {
     fn check(&self) -> Result<(), Error> {
         check_lens(&self.name, &self.intrinsics)?;
         check(&self.name, "rate_hz", self.rate_hz, 0.01, 200.0)?;
-        let pose =
-            self.parent_from_camera.translation.vector.iter().chain(self.parent_from_camera.rotation.coords.iter());
-        for number in pose {
-            check(&self.name, "parent_from_camera", *number, -100.0, 100.0)?;
-        }
+        check_pose(&self.name, "parent_from_camera", &self.parent_from_camera)?;
         check(&self.name, "stamp_to_mid_exposure", self.stamps.to_mid_exposure_secs, -1.0, 1.0)?;
         check(&self.name, "clock_drift", self.stamps.drift_frac, -0.01, 0.01)?;
         let sensor = &self.sensor;
@@ -471,6 +491,11 @@ fn check_lens(of: &str, lens: &Intrinsics) -> Result<(), Error> {
     Ok(())
 }
 
+fn check_pose(of: &str, key: &'static str, pose: &Transform) -> Result<(), Error> {
+    let mut numbers = pose.translation.vector.iter().chain(pose.rotation.coords.iter());
+    numbers.try_for_each(|number| check(of, key, *number, -100.0, 100.0))
+}
+
 /// Rejects numbers outside `lower..=upper`, and NaN.
 fn check(of: &str, key: &'static str, got: f64, lower: f64, upper: f64) -> Result<(), Error> {
     if got >= lower && got <= upper {
@@ -493,5 +518,10 @@ mod tests {
         config = Config::default();
         config.cameras.push(CameraConfig::wrist("wrist"));
         assert!(matches!(config.check(), Err(Error::DuplicateName { .. })));
+        config = Config::default();
+        let (name, spec) = ("wall".to_owned(), "chessboard:9x6:25".to_owned());
+        config.targets.push(TargetConfig { name, spec, world_from_board: Transform::identity() });
+        let message = config.check().expect_err("no unit").to_string();
+        assert!(message.contains("wall") && message.contains("no unit"), "{message}");
     }
 }

@@ -49,6 +49,22 @@ pub enum Error {
         /// The name.
         camera: String,
     },
+    /// The specification of a printed target is invalid.
+    #[error("target {target:?}: {source}")]
+    Target {
+        /// Name of the target in the rig file.
+        target: String,
+        /// Cause.
+        source: targets::SpecError,
+    },
+    /// A printed target cannot be drawn.
+    #[error("target {target:?} cannot be drawn: {source}")]
+    DrawTarget {
+        /// Name of the target in the rig file.
+        target: String,
+        /// Cause.
+        source: targets::PrintError,
+    },
     /// MuJoCo rejected the generated scene.
     #[error("MuJoCo rejected the scene: {reason}")]
     Scene {
@@ -65,7 +81,7 @@ pub enum Error {
     #[error("cannot encode the texture {name:?}")]
     Texture {
         /// Name of the texture.
-        name: &'static str,
+        name: String,
         /// Cause.
         source: image::ImageError,
     },

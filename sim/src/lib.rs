@@ -35,6 +35,7 @@ mod noise;
 mod objects;
 mod optics;
 mod panda;
+mod printed_target;
 mod random;
 mod render;
 mod rig;
@@ -56,7 +57,8 @@ pub mod layout {
 }
 
 pub use config::{
-    BaseConfig, CameraConfig, Config, DepthConfig, DepthSensor, Parent, ScannerConfig, Scene, SensorConfig, StampConfig,
+    BaseConfig, CameraConfig, Config, DepthConfig, DepthSensor, Parent, ScannerConfig, Scene, SensorConfig,
+    StampConfig, TargetConfig,
 };
 pub use error::Error;
 pub use live::{LiveRig, LiveTruth};

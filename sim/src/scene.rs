@@ -4,7 +4,7 @@ use crate::base;
 use crate::config::{Config, Parent, Scene};
 use crate::objects::{self, Object};
 use crate::texture::Texture;
-use crate::{Error, cabinet, lab, light, panda};
+use crate::{Error, cabinet, lab, light, panda, printed_target};
 use mujoco_rs::prelude::MjModel;
 use mujoco_rs::wrappers::mj_auxiliary::MjVfs;
 use nalgebra::{Point3, Translation3};
@@ -58,6 +58,25 @@ pub(crate) fn build(config: &Config, largest_px: [u32; 2]) -> Result<MjModel, Er
         let group = if *material == "glass" { GLASS_GROUP } else { 0 };
         let _ =
             writeln!(bodies, "<geom type=\"mesh\" mesh=\"{name}\" material=\"{material}\" group=\"{group}\" {pose}/>");
+    }
+    for (ix, target) in config.targets.iter().enumerate() {
+        let printed_target::Printed { png, mesh, plate } = printed_target::print(target)?;
+        let (name, pose) = (format!("target{ix}"), panda::pose_attributes(&target.world_from_board));
+        add_file(&mut files, &format!("{name}.png"), &png)?;
+        add_file(&mut files, &format!("{name}.msh"), &mesh.to_msh())?;
+        add_file(&mut files, &format!("{name}_plate.msh"), &plate.to_msh())?;
+        let _ = writeln!(
+            assets,
+            "<texture name=\"{name}\" type=\"2d\" file=\"{name}.png\"/>\n\
+             <material name=\"{name}\" texture=\"{name}\" specular=\"0\"/>\n\
+             <mesh name=\"{name}\" file=\"{name}.msh\" inertia=\"shell\"/>\n\
+             <mesh name=\"{name}_plate\" file=\"{name}_plate.msh\" inertia=\"shell\"/>"
+        );
+        let _ = writeln!(
+            bodies,
+            "<geom type=\"mesh\" mesh=\"{name}\" material=\"{name}\" {pose}/>\n\
+             <geom type=\"mesh\" mesh=\"{name}_plate\" material=\"frame\" {pose}/>"
+        );
     }
     let [near, far] = near_far_m(config.scene);
     let [width, height] = largest_px;
@@ -132,7 +151,7 @@ impl SceneAssets {
             return Ok(Arc::clone(scene_assets));
         }
         let encode = |(name, texture): (&'static str, Texture)| {
-            texture.to_png().map(|png| (name, png)).map_err(|source| Error::Texture { name, source })
+            texture.to_png().map(|png| (name, png)).map_err(|source| Error::Texture { name: name.to_owned(), source })
         };
         let (textures, objects) = match scene {
             Scene::StaticArm => (objects::textures(), objects::objects()),

@@ -202,6 +202,22 @@ pub enum NotDetected {
         /// Ids in the image.
         found: Ids,
     },
+    /// The markers are larger or smaller relative to the squares.
+    #[error(
+        "the markers are about {:.2} times as wide as the squares, expected {:.2}; measure both on the print: if a square has {square}, a marker has about {marker}",
+        found_frac,
+        expected_frac
+    )]
+    MarkerSize {
+        /// Side of a marker in the image relative to that of a square.
+        found_frac: f64,
+        /// The same of the target.
+        expected_frac: f64,
+        /// Side of a square of the target.
+        square: String,
+        /// Side of a marker in the image if the squares have this size.
+        marker: String,
+    },
     /// The markers are mirrored.
     #[error("found {n} mirrored markers; the image is flipped or the target was printed mirrored")]
     Mirrored {

@@ -25,7 +25,14 @@ pub enum ClosedForm {
 }
 
 impl ClosedForm {
-    pub(super) const ALL: [Self; 3] = [Self::ParkMartin, Self::Daniilidis, Self::TsaiLenz];
+    /// All solvers.
+    pub const ALL: [Self; 3] = [Self::ParkMartin, Self::Daniilidis, Self::TsaiLenz];
+
+    /// Pose of the camera on the flange from pairs `(base_from_flange, camera_from_board)`. All pairs have the same
+    /// weight, so a wrong one spoils the result. `None` if the rotation axes of the motions are parallel.
+    pub fn flange_from_camera(self, pairs: &[(Transform, Transform)]) -> Option<Transform> {
+        self.solve(&motions(pairs))
+    }
 
     /// Solves `a x = x b` for all motions. `None` if the rotation axes of the motions are parallel.
     pub(super) fn solve(self, motions: &[Motion]) -> Option<Transform> {

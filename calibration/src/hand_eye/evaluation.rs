@@ -1,4 +1,4 @@
-//! Errors of a solution: scatter of the board and leave-one-out prediction.
+//! Errors of a solution: scatter of the board and cross-validation.
 
 use super::Setup;
 use super::geometry::{self, Solution};
@@ -29,25 +29,30 @@ pub(super) fn scatter(boards: &[Transform]) -> Option<Scatter> {
     Some(Scatter { mm: 1e3 * rms(distances.sum()), deg: rms(angles.sum()).to_degrees() })
 }
 
-/// Solution of all measurements but one, for each of them.
+/// Largest number of fits of a cross-validation. With more measurements, several are left out at a time.
+pub const MAX_FOLDS: usize = 60;
+
+/// For each measurement, the solution of the others: leave-one-out, or with many measurements cross-validation in
+/// [`MAX_FOLDS`] interleaved folds.
 ///
 /// * `knows_noise`: keeps the given noise, which is faster than estimating it without the measurement.
-pub(super) fn leave_one_out(
+pub(super) fn held_out_solutions(
     setup: Setup,
     measurements: &[Measurement],
     solution: Solution,
     noise: HandEyeNoise,
     knows_noise: bool,
 ) -> Vec<Option<Solution>> {
-    (0..measurements.len())
-        .map(|left_out| {
-            let mut others = measurements.to_vec();
-            others.remove(left_out);
-            (others.len() >= 3).then_some(())?;
-            let fit = if knows_noise { pose_fit::fit_with_known_noise } else { pose_fit::fit };
-            Some(fit(setup, &others, solution, noise).ok()?.solution)
-        })
-        .collect()
+    let n_folds = measurements.len().min(MAX_FOLDS);
+    let without = |fold: usize| {
+        let others = measurements.iter().enumerate().filter(|(ix, _)| ix % n_folds != fold);
+        let others: Vec<Measurement> = others.map(|(_, measurement)| measurement.clone()).collect();
+        (others.len() >= 3).then_some(())?;
+        let fit = if knows_noise { pose_fit::fit_with_known_noise } else { pose_fit::fit };
+        Some(fit(setup, &others, solution, noise).ok()?.solution)
+    };
+    let folds: Vec<Option<Solution>> = (0..n_folds).map(without).collect();
+    (0..measurements.len()).map(|ix| folds[ix % n_folds]).collect()
 }
 
 /// Sum of squared reprojection errors, square pixels; infinite if a point cannot be projected.

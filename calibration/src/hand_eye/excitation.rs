@@ -58,6 +58,26 @@ pub(crate) fn check_rotations(base_from_flange: &[Transform], body: &str) -> Res
     })
 }
 
+/// How far the robot rotated about three orthogonal axes of the flange, the largest rotation first.
+#[derive(Clone, Debug, PartialEq)]
+pub struct RotationExcitation {
+    /// RMS rotations about the axes, radians.
+    pub rms_rad: [f64; 3],
+    /// The axes in the flange frame, as text.
+    pub axes: [String; 3],
+    /// Smallest RMS rotation about the second axis that is accepted, radians.
+    pub min_rad: f64,
+}
+
+impl RotationExcitation {
+    /// The rotations of the given flange poses. `None` without poses.
+    pub fn of(base_from_flange: &[Transform]) -> Option<Self> {
+        let (rms_rad, axes) = rotation_spread(base_from_flange)?;
+        let axes = [0, 1, 2].map(|ix| axis_name(&axes.column(ix).into_owned(), "flange"));
+        Some(Self { rms_rad, axes, min_rad: 1.0 / MAX_AMPLIFICATION })
+    }
+}
+
 /// RMS rotations about three orthogonal axes of the body, radians, the largest first, and the axes as columns.
 pub(super) fn rotation_spread(poses: &[Transform]) -> Option<([f64; 3], Matrix3<f64>)> {
     let sum: Matrix3<f64> = poses.iter().map(|pose| pose.rotation.to_rotation_matrix().into_inner()).sum();

@@ -1,7 +1,8 @@
-//! Names common mistakes in the input: wrong units, inverted transforms, mirrored boards.
+//! Names common mistakes in the input: wrong units, inverted transforms, mirrored boards, lists that are off by one.
 
 use super::closed_form::{self, ClosedForm};
 use super::consensus::{self, Consensus};
+use super::geometry;
 use super::refusal::Refusal;
 use super::samples::Sample;
 use super::{BoardObservation, HandEyeInput, HandEyeSample, Setup};
@@ -56,6 +57,9 @@ pub(super) fn explain(input: &HandEyeInput<'_>, samples: &[Sample], consensus: O
         "no hand-eye transform explains three of the samples".to_owned()
     };
     let has_poses = samples.iter().all(|sample| sample.candidates.iter().all(|candidate| candidate.corners.is_none()));
+    if let Some(refusal) = shift_mistake(input, samples, found_m, distance_m) {
+        return Some(refusal);
+    }
     if let Some(scale) = scale_mistake(samples, consensus) {
         return Some(Refusal::new(format!("{residual}, and {}", scale.0), scale.1));
     }
@@ -107,6 +111,46 @@ pub(super) fn explain(input: &HandEyeInput<'_>, samples: &[Sample], consensus: O
     })
 }
 
+/// Explanation by lists of robot poses and images that are off by one, if pairing each image with the robot pose of the
+/// next or the previous sample makes the samples agree.
+fn shift_mistake(input: &HandEyeInput<'_>, samples: &[Sample], found_m: f64, distance_m: f64) -> Option<Refusal> {
+    /// A shift by chance does not fit this many samples better.
+    const MIN_SAMPLES: usize = 6;
+    /// Better fits cannot be improved by a shift.
+    const MIN_FRAC: f64 = 0.002;
+    if samples.len() < MIN_SAMPLES || found_m < MIN_FRAC * distance_m {
+        return None;
+    }
+    let shifted_m = |shift: isize| {
+        let moved = |sample: &Sample| {
+            let other = input.samples.get(sample.sample_ix.checked_add_signed(shift)?)?;
+            Some(Sample { a: geometry::a_of(input.setup, &other.base_from_flange), ..sample.clone() })
+        };
+        let moved: Vec<Sample> = samples.iter().filter_map(moved).collect();
+        let is_enough = moved.len() + 1 >= MIN_SAMPLES;
+        is_enough.then(|| consensus::find(&moved)).flatten().map_or(f64::INFINITY, |found| found.median_m())
+    };
+    let (shift, best_m) = [(1, shifted_m(1)), (-1, shifted_m(-1))].into_iter().min_by(|a, b| a.1.total_cmp(&b.1))?;
+    if best_m * MUCH_BETTER > found_m.min(distance_m) {
+        return None;
+    }
+    let (other, missing) = if shift > 0 {
+        ("next", "the first image or board pose is missing")
+    } else {
+        ("previous", "the first robot pose is missing")
+    };
+    let before = if found_m.is_finite() { format!("within {:.1} mm", 1e3 * found_m) } else { "not at all".to_owned() };
+    let has_images = samples.iter().any(|sample| sample.candidates.iter().any(|candidate| candidate.corners.is_some()));
+    let board = if has_images { "image" } else { "board pose" };
+    Some(Refusal::new(
+        format!(
+            "the robot poses and {board}s are off by one: the samples agree {before} (median), but within {:.1} mm if each {board} is paired with the robot pose of the {other} sample",
+            1e3 * best_m
+        ),
+        format!("check that both lists start with the same sample: {missing}, or one list counts from 1"),
+    ))
+}
+
 /// Explanation by different units of the robot's and the board's translations, and the remedy.
 fn scale_mistake(samples: &[Sample], consensus: Option<&Consensus>) -> Option<(String, String)> {
     const MIN_SIGMAS: f64 = 5.0;
@@ -121,7 +165,8 @@ fn scale_mistake(samples: &[Sample], consensus: Option<&Consensus>) -> Option<(S
     let motions = closed_form::motions(&pairs);
     let rotation = ClosedForm::ParkMartin.solve(&motions)?.rotation;
     let (scale, sigma) = closed_form::relative_scale(&motions, rotation)?;
-    if scale.is_nan() || scale == 0.0 || (scale - 1.0).abs() < MIN_CHANGE.max(MIN_SIGMAS * sigma) {
+    // Unrelated motions have a scale near 0.
+    if scale.is_nan() || scale.abs() <= MIN_SIGMAS * sigma || (scale - 1.0).abs() < MIN_CHANGE.max(MIN_SIGMAS * sigma) {
         return None;
     }
     // The scale must explain the disagreement.

@@ -4,7 +4,7 @@
 //! Closed-form solutions of sample triples give an initial solution that most samples agree with. It is
 //! refined from board poses by generalized least squares, with noise variances estimated by restricted maximum
 //! likelihood, or from corners by minimizing the reprojection error, with a small unknown error of each robot pose. The
-//! result has an uncertainty and leave-one-out errors. Input that does not determine the result is refused.
+//! result has an uncertainty and the errors of held-out samples. Input that does not determine the result is refused.
 
 mod closed_form;
 mod consensus;
@@ -12,6 +12,7 @@ mod corner_fit;
 mod evaluation;
 mod excitation;
 mod geometry;
+mod intrinsics_doubt;
 mod mistakes;
 mod next_poses;
 mod planar_pose;
@@ -22,16 +23,20 @@ mod report;
 mod samples;
 #[cfg(test)]
 pub(crate) mod scene;
+mod selection;
+mod shutter;
 #[cfg(test)]
 mod tests;
 
 pub use closed_form::ClosedForm;
 pub(crate) use closed_form::nearest_rotation;
-pub use evaluation::Scatter;
+pub use evaluation::{MAX_FOLDS, Scatter};
+pub use excitation::RotationExcitation;
 pub use next_poses::{NextPose, NextPoseOptions, suggest_next_poses};
 pub use pose_fit::HandEyeNoise;
 pub use refusal::Refusal;
 pub use report::{HandEyeCalibration, JointOffset, SampleReport, SampleStatus};
+pub use shutter::{FlangeMotion, corners_at_mid_exposure};
 
 use crate::{BoardView, Error};
 use kinematics::{Chain, Intrinsics, Transform, transform};
@@ -107,8 +112,8 @@ impl Default for HandEyeOptions {
             estimate_intrinsics: false,
             estimate_joint_offsets: false,
             board_is_seen: true,
-            max_sigma_m: 0.01,
-            max_sigma_rad: 1.0_f64.to_radians(),
+            max_sigma_m: 0.005,
+            max_sigma_rad: 0.5_f64.to_radians(),
         }
     }
 }
@@ -179,8 +184,19 @@ pub fn calibrate_hand_eye(input: &HandEyeInput<'_>) -> Result<HandEyeCalibration
         input.options.max_sigma_rad,
         input.setup == Setup::EyeInHand,
     )
-    .map_err(refused)?;
+    .map_err(|refusal| {
+        let doubt = refined.intrinsics_doubt.as_deref();
+        refused(with_doubt(refusal.with_warnings(&calibration.warnings, doubt), doubt))
+    })?;
     Ok(calibration)
+}
+
+/// The refusal of an uncertain result. Wrong intrinsics are the more likely reason if the corners contradict them.
+fn with_doubt(refusal: Refusal, doubt: Option<&str>) -> Refusal {
+    match doubt {
+        Some(doubt) => Refusal { motion: format!("{doubt}; otherwise, {}", refusal.motion), ..refusal },
+        None => refusal,
+    }
 }
 
 fn too_few(n: usize, what: &str) -> Refusal {

@@ -4,6 +4,7 @@
 //! plane-based pose estimation", section 4.3). Both are refined by minimizing the reprojection error.
 
 use super::closed_form::nearest_rotation;
+use crate::intrinsics::board_pose::moved;
 use crate::intrinsics::homography;
 use crate::least_squares::{self, BlockSums, Loss};
 use crate::{BoardPoint, BoardView};
@@ -36,34 +37,40 @@ impl BoardPose {
     }
 }
 
-/// A pose after a small rotation about the origin of the board, in camera axes, and a translation in camera axes.
-pub(super) fn moved(pose: &Transform, step: &Vector6<f64>) -> Transform {
-    let rotation = UnitQuaternion::from_scaled_axis(step.fixed_rows::<3>(0).into_owned());
-    Transform::from_parts((pose.translation.vector + step.fixed_rows::<3>(3)).into(), rotation * pose.rotation)
+/// The poses that explain the corners, best first: one or two. Empty if the corners do not determine a pose. Corners
+/// beyond the range of the lens model are outliers.
+pub(super) fn board_poses(view: &BoardView, intrinsics: &Intrinsics) -> Vec<BoardPose> {
+    let ray = |point: &BoardPoint| intrinsics.unproject(point.pixel).map(|ray| ray.xy());
+    let rays: Vec<Option<Vector2<f64>>> = view.points.iter().map(ray).collect();
+    let seen = view.points.iter().zip(&rays).filter(|(_, ray)| ray.is_some()).map(|(point, _)| *point);
+    let seen: Vec<BoardPoint> = seen.collect();
+    let mut poses = poses_in_range(&seen, &rays.iter().flatten().copied().collect::<Vec<_>>(), intrinsics);
+    for pose in &mut poses {
+        let mut of_seen = std::mem::take(&mut pose.is_inlier).into_iter();
+        pose.is_inlier = rays.iter().map(|ray| ray.is_some() && of_seen.next().unwrap_or(false)).collect();
+    }
+    poses
 }
 
-/// The poses that explain the corners, best first: one or two. Empty if the corners do not determine a pose.
-pub(super) fn board_poses(view: &BoardView, intrinsics: &Intrinsics) -> Vec<BoardPose> {
-    let rays: Option<Vec<Vector2<f64>>> =
-        view.points.iter().map(|point| intrinsics.unproject(point.pixel).map(|ray| ray.xy())).collect();
-    let Some(rays) = rays else { return Vec::new() };
-    let Some(plane) = Plane::new(&view.points) else { return Vec::new() };
-    let all = vec![true; view.points.len()];
+/// [`board_poses`] of corners in the range of the lens model.
+fn poses_in_range(points: &[BoardPoint], rays: &[Vector2<f64>], intrinsics: &Intrinsics) -> Vec<BoardPose> {
+    let Some(plane) = Plane::new(points) else { return Vec::new() };
+    let all = vec![true; points.len()];
     let attempt = |is_inlier: &[bool]| -> Vec<BoardPose> {
-        let Some(homography) = homography(&plane.points, &rays, is_inlier) else { return Vec::new() };
+        let Some(homography) = homography(&plane.points, rays, is_inlier) else { return Vec::new() };
         let mut poses: Vec<BoardPose> = initial_rotations(&homography)
             .into_iter()
             .filter_map(|rotation| {
-                let camera_from_plane = with_translation(rotation, &plane.points, &rays, is_inlier)?;
-                refine(camera_from_plane * plane.plane_from_board, view, intrinsics, is_inlier)
+                let camera_from_plane = with_translation(rotation, &plane.points, rays, is_inlier)?;
+                refine(camera_from_plane * plane.plane_from_board, points, intrinsics, is_inlier)
             })
             .collect();
         poses.sort_by(|a, b| a.squares_px2.total_cmp(&b.squares_px2));
         poses
     };
     let mut poses = attempt(&all);
-    let has_outliers = poses.first().is_none_or(|best| best.n_inliers() < view.points.len());
-    if has_outliers && let Some(consensus) = consensus_corners(&plane.points, &rays, intrinsics) {
+    let has_outliers = poses.first().is_none_or(|best| best.n_inliers() < points.len());
+    if has_outliers && let Some(consensus) = consensus_corners(&plane.points, rays, intrinsics) {
         let robust = attempt(&consensus);
         let n_inliers = |poses: &[BoardPose]| poses.first().map_or(0, BoardPose::n_inliers);
         if n_inliers(&robust) >= n_inliers(&poses) {
@@ -221,8 +228,8 @@ fn residual(pose: &Transform, point: &BoardPoint, intrinsics: &Intrinsics) -> Op
     Some(([pixel[0] - point.pixel[0], pixel[1] - point.pixel[1]], [row(0), row(1)]))
 }
 
-fn refine(initial: Transform, view: &BoardView, intrinsics: &Intrinsics, is_used: &[bool]) -> Option<BoardPose> {
-    let used = view.points.iter().zip(is_used).filter(|(_, used)| **used).map(|(point, _)| point);
+fn refine(initial: Transform, points: &[BoardPoint], intrinsics: &Intrinsics, is_used: &[bool]) -> Option<BoardPose> {
+    let used = points.iter().zip(is_used).filter(|(_, used)| **used).map(|(point, _)| point);
     let problem = Reprojection { points: used.collect(), intrinsics, distance_m: initial.translation.vector.norm() };
     let options = least_squares::Options {
         loss: Loss::Huber { threshold: LOSS_THRESHOLD_PX },
@@ -230,8 +237,7 @@ fn refine(initial: Transform, view: &BoardView, intrinsics: &Intrinsics, is_used
         ..least_squares::Options::default()
     };
     let pose = least_squares::minimize(&problem, initial, &options).ok()?.state;
-    let errors: Vec<f64> = view
-        .points
+    let errors: Vec<f64> = points
         .iter()
         .map(|point| residual(&pose, point, intrinsics).map_or(f64::INFINITY, |(error, _)| error[0].hypot(error[1])))
         .collect();
@@ -239,7 +245,7 @@ fn refine(initial: Transform, view: &BoardView, intrinsics: &Intrinsics, is_used
     let is_inlier: Vec<bool> = errors.iter().map(|error| *error <= limit).collect();
     let mut information = Matrix6::zeros();
     let mut squares_px2 = 0.0;
-    for ((point, error), _) in view.points.iter().zip(&errors).zip(&is_inlier).filter(|(_, is_inlier)| **is_inlier) {
+    for ((point, error), _) in points.iter().zip(&errors).zip(&is_inlier).filter(|(_, is_inlier)| **is_inlier) {
         let (_, rows) = residual(&pose, point, intrinsics)?;
         for row in rows {
             let row = Vector6::from(row);
@@ -315,6 +321,25 @@ fn consensus_corners(points: &[Vector2<f64>], rays: &[Vector2<f64>], intrinsics:
 mod tests {
     use super::super::scene;
     use super::*;
+
+    #[test]
+    fn only_the_corner_beyond_the_lens_model_is_dropped() {
+        // With this distortion, no point is imaged far from the center.
+        let lens = kinematics::Lens::BrownConrady([-0.3, 0.0, 0.0, 0.0, 0.0]);
+        let intrinsics = Intrinsics { lens, ..scene::intrinsics() };
+        let pose = Transform::new(Vector3::new(-0.05, 0.02, 0.6), Vector3::new(0.4, -0.3, 0.2));
+        let image = |point_in_board: Vector3<f64>| {
+            let pixel = intrinsics.project(&(pose * nalgebra::Point3::from(point_in_board)).coords)?;
+            Some(BoardPoint { point_in_board, pixel })
+        };
+        let points: Vec<BoardPoint> = scene::board_points().into_iter().filter_map(image).collect();
+        let mut view = BoardView { name: "view".to_owned(), points };
+        view.points[7].pixel = [1e4, -2e4];
+        assert!(intrinsics.unproject(view.points[7].pixel).is_none());
+        let found = &board_poses(&view, &intrinsics)[0];
+        assert!((found.camera_from_board.translation.vector - pose.translation.vector).norm() < 1e-8);
+        assert!(!found.is_inlier[7] && found.n_inliers() == view.points.len() - 1, "{:?}", found.is_inlier);
+    }
 
     #[test]
     fn exact_corners_give_exact_pose() {

@@ -2,17 +2,19 @@
 
 use super::closed_form::ClosedForm;
 use super::consensus::{self, Consensus};
-use super::corner_fit::{self, CornerProblem, CornerState, View};
+use super::corner_fit::{self, CornerState};
 use super::evaluation;
 use super::geometry::{self, N_PARAMS, Solution};
+use super::intrinsics_doubt::IntrinsicsDoubt;
 use super::planar_pose;
 use super::pose_fit::{self, HandEyeNoise, Measurement, PoseFit};
 use super::samples::{self, Sample};
-use super::{BoardObservation, HandEyeInput, MIN_SAMPLES, Refusal};
+use super::selection::{Free, Selection, Stage, corner_fit, corner_noise, corners, reject_and_fit, select};
+use super::{HandEyeInput, Refusal};
+use crate::Error;
 use crate::least_squares::Fit;
-use crate::{BoardPoint, Error};
 use kinematics::{Intrinsics, Transform};
-use nalgebra::{DMatrix, DVector, Vector6};
+use nalgebra::{DMatrix, Vector6};
 
 /// Result of [`refine`].
 #[derive(Clone, Debug)]
@@ -35,7 +37,8 @@ pub(super) struct Refined {
     pub(super) intrinsics_sigma: Vec<f64>,
     /// Offsets of the inner joints and their standard deviations.
     pub(super) joint_offsets: Vec<(f64, f64)>,
-    pub(super) warnings: Vec<String>,
+    /// Why the given intrinsics may be wrong.
+    pub(super) intrinsics_doubt: Option<String>,
 }
 
 impl Refined {
@@ -86,7 +89,7 @@ pub(super) fn refine(
             stage.fit.covariance += doubt.covariance(&stage.fit.solution);
         }
         let mut refined = finish(samples, choice, stage, closed_form, Some(given));
-        refined.warnings.extend(doubt.map(|doubt| doubt.warning));
+        refined.intrinsics_doubt = doubt.map(|doubt| doubt.warning);
         return Ok(refined);
     }
     let free = minimize_free(input, &mut samples, &mut choice, &mut stage, given)?;
@@ -151,51 +154,6 @@ fn minimize_corners(selection: Selection<'_>, intrinsics: &Intrinsics) -> Result
     Ok(corner_fit(selection, intrinsics, &[], fixed)?.state.solution)
 }
 
-/// The corners contradict the given intrinsics.
-struct IntrinsicsDoubt {
-    free: Solution,
-    free_covariance: DMatrix<f64>,
-    warning: String,
-}
-
-impl IntrinsicsDoubt {
-    /// `None` if free intrinsics do not fit significantly better.
-    fn new(selection: Selection<'_>, intrinsics: &Intrinsics) -> Option<Self> {
-        let fit = |is_free: bool| {
-            let free = Free { intrinsics: is_free, joints: false };
-            corner_fit(selection, intrinsics, &[], free).ok()
-        };
-        let (fixed, free) = (fit(false)?, fit(true)?);
-        // Twice the decrease of the cost has as many degrees of freedom as there are intrinsics. Residuals of real
-        // images are not independent, so their variance scales it, and the limit is generous.
-        let n_params = intrinsics.params().len() as f64;
-        let decrease = 2.0 * (fixed.cost - free.cost) / free.variance.max(1.0);
-        (decrease > n_params + 6.0 * (2.0 * n_params).sqrt()).then_some(())?;
-        let change = fixed.state.solution.x.inverse() * free.state.solution.x;
-        let warning = format!(
-            "the corners contradict the given intrinsics: with free intrinsics, the focal length changes from {:.1} to {:.1} px, and the camera moves by {:.1} mm and {:.2} degrees, which is included in the uncertainty; calibrate the intrinsics, or estimate them here",
-            intrinsics.focal_px[0],
-            free.state.intrinsics.focal_px[0],
-            1e3 * change.translation.vector.norm(),
-            change.rotation.angle().to_degrees()
-        );
-        let free_covariance = free.covariance.view((0, 0), (N_PARAMS, N_PARAMS)).into_owned();
-        Some(Self { free: free.state.solution, free_covariance, warning })
-    }
-
-    /// Covariance to add to that of a solution with the given intrinsics: that of free intrinsics, and the square of the
-    /// difference.
-    fn covariance(&self, solution: &Solution) -> DMatrix<f64> {
-        let mut shift = DVector::zeros(N_PARAMS);
-        for (first, from, to) in [(0, solution.x, self.free.x), (6, solution.y, self.free.y)] {
-            let change = from.inverse() * to;
-            shift.fixed_rows_mut::<3>(first).copy_from(&change.rotation.scaled_axis());
-            shift.fixed_rows_mut::<3>(first + 3).copy_from(&change.translation.vector);
-        }
-        &self.free_covariance + &shift * shift.transpose()
-    }
-}
-
 /// Replaces the poses of the samples by steps from the predicted ones.
 fn relinearize(
     input: &HandEyeInput<'_>,
@@ -241,7 +199,7 @@ fn choose_weights(selection: Selection<'_>, intrinsics: &Intrinsics) -> Result<(
         .map(|((sample, choice), _)| (sample, *choice))
         .collect();
     let held_out_error = |weighting: HandEyeNoise| -> Option<f64> {
-        let folds = evaluation::leave_one_out(input.setup, &measurements, estimated.solution, weighting, true);
+        let folds = evaluation::held_out_solutions(input.setup, &measurements, estimated.solution, weighting, true);
         let folds: Vec<Solution> = folds.into_iter().collect::<Option<_>>()?;
         let squares_px2 = used.iter().zip(&folds).map(|((sample, choice), solution)| {
             let points = corners(input, sample, *choice);
@@ -279,10 +237,6 @@ fn with_offsets<'a>(input: &HandEyeInput<'a>, offsets: &[f64]) -> HandEyeInput<'
     corrected
 }
 
-fn select(measurements: &[Measurement], is_inlier: &[bool]) -> Vec<Measurement> {
-    measurements.iter().zip(is_inlier).filter(|(_, is_inlier)| **is_inlier).map(|(m, _)| m.clone()).collect()
-}
-
 /// The closed form with the smallest leave-one-out scatter, and its solution.
 fn best_closed_form(measurements: &[Measurement], fallback: Solution) -> (ClosedForm, Solution) {
     const MAX_FOLDS: usize = 20;
@@ -304,139 +258,6 @@ fn best_closed_form(measurements: &[Measurement], fallback: Solution) -> (Closed
         .filter_map(|solver| Some((score(solver)?, solver, consensus::solve(&pairs, solver)?)))
         .min_by(|a, b| a.0.total_cmp(&b.0))
         .map_or((ClosedForm::ParkMartin, fallback), |(_, solver, solution)| (solver, solution))
-}
-
-/// Standard deviation of the corners from the residuals of the single images, pixels. `None` for given poses.
-fn corner_noise(samples: &[Sample], choice: &[usize], is_inlier: &[bool]) -> Option<f64> {
-    const MIN_PX: f64 = 0.003; // Exact corners of a simulation.
-    let (mut squares, mut n_free) = (0.0, 0.0);
-    for ((sample, choice), _) in samples.iter().zip(choice).zip(is_inlier).filter(|(_, is_inlier)| **is_inlier) {
-        let corners = sample.candidates[*choice].corners.as_ref()?;
-        squares += corners.squares_px2;
-        n_free += 2.0 * corners.is_inlier.iter().filter(|is_inlier| **is_inlier).count() as f64 - 6.0;
-    }
-    Some((squares / f64::max(n_free, 1.0)).sqrt().max(MIN_PX))
-}
-
-/// A fit and the samples that agree with it.
-struct Stage {
-    fit: PoseFit,
-    /// Noise that determines the weights of the fit.
-    weighting: HandEyeNoise,
-    is_inlier: Vec<bool>,
-    squared_distances: Vec<f64>,
-}
-
-/// Alternates between fits and the selection of samples and candidates.
-fn reject_and_fit(
-    input: &HandEyeInput<'_>,
-    samples: &[Sample],
-    choice: &mut Vec<usize>,
-    mut is_inlier: Vec<bool>,
-    initial: Solution,
-    mut noise: HandEyeNoise,
-) -> Result<Stage, Error> {
-    /// Squared distance with six degrees of freedom that one good sample in 100 000 exceeds.
-    const MAX_SQUARED_DISTANCE: f64 = 33.1;
-    const MAX_ROUNDS: usize = 8;
-    let mut solution = initial;
-    let mut stage = None;
-    for _ in 0..MAX_ROUNDS {
-        let n_used = is_inlier.iter().filter(|is_inlier| **is_inlier).count();
-        if n_used < MIN_SAMPLES || 2 * n_used < samples.len() {
-            return Err(Error::Refused(Box::new(Refusal::new(
-                format!("only {n_used} of {} samples agree with each other", samples.len()),
-                "check that each robot pose belongs to its image and that neither board nor camera was moved",
-            ))));
-        }
-        let measurements = pose_fit::measurements(samples, choice);
-        let fit = pose_fit::fit(input.setup, &select(&measurements, &is_inlier), solution, noise)?;
-        (solution, noise) = (fit.solution, fit.noise);
-        let next_choice = consensus::choose(samples, &solution);
-        let measurements = pose_fit::measurements(samples, &next_choice);
-        let squared_distances: Vec<f64> = measurements
-            .iter()
-            .zip(&is_inlier)
-            .map(|(measurement, is_used)| pose_fit::squared_distance(input.setup, measurement, &fit, *is_used))
-            .collect();
-        let next: Vec<bool> = squared_distances.iter().map(|squared| *squared <= MAX_SQUARED_DISTANCE).collect();
-        let is_settled = next == is_inlier && next_choice == *choice;
-        stage = Some(Stage { weighting: fit.noise, fit, is_inlier: is_inlier.clone(), squared_distances });
-        if is_settled {
-            break;
-        }
-        (is_inlier, *choice) = (next, next_choice);
-    }
-    stage.ok_or(Error::TooFewResiduals { n_residuals: 0, n_params: N_PARAMS })
-}
-
-/// Corners of a sample in the chosen board frame, without outliers.
-pub(super) fn corners(input: &HandEyeInput<'_>, sample: &Sample, choice: usize) -> Vec<BoardPoint> {
-    let candidate = &sample.candidates[choice];
-    let (BoardObservation::View(view), Some(corners)) = (&input.samples[sample.sample_ix].board, &candidate.corners)
-    else {
-        return Vec::new();
-    };
-    let equivalent_from_board = candidate.board_from_equivalent.inverse();
-    view.points
-        .iter()
-        .zip(&corners.is_inlier)
-        .filter(|(_, is_inlier)| **is_inlier)
-        .map(|(point, _)| BoardPoint {
-            point_in_board: (equivalent_from_board * nalgebra::Point3::from(point.point_in_board)).coords,
-            pixel: point.pixel,
-        })
-        .collect()
-}
-
-/// Samples, the candidate of each, and the fit to those that agree.
-#[derive(Clone, Copy)]
-struct Selection<'a> {
-    input: &'a HandEyeInput<'a>,
-    samples: &'a [Sample],
-    choice: &'a [usize],
-    stage: &'a Stage,
-}
-
-/// What is estimated besides hand-eye transform and board pose.
-#[derive(Clone, Copy)]
-struct Free {
-    intrinsics: bool,
-    joints: bool,
-}
-
-fn corner_fit(
-    selection: Selection<'_>,
-    intrinsics: &Intrinsics,
-    offsets: &[f64],
-    free: Free,
-) -> Result<Fit<CornerState>, Error> {
-    let Selection { input, samples, choice, stage } = selection;
-    let used = samples.iter().zip(choice).zip(&stage.is_inlier).filter(|(_, is_inlier)| **is_inlier);
-    let chain = input.chain.filter(|_| free.joints);
-    let views: Vec<View> = used
-        .map(|((sample, choice), _)| {
-            let given = &input.samples[sample.sample_ix];
-            let joints = chain.and(given.joints.clone()).unwrap_or_default();
-            View { base_from_flange: given.base_from_flange, points: corners(input, sample, *choice), joints }
-        })
-        .collect();
-    let problem = CornerProblem {
-        setup: input.setup,
-        views: &views,
-        noise: stage.weighting,
-        n_intrinsics: if free.intrinsics { intrinsics.params().len() } else { 0 },
-        chain,
-    };
-    let n_inner = chain.map_or(0, |chain| chain.n_joints().saturating_sub(2));
-    let joint_offsets = if offsets.len() == n_inner { offsets.to_vec() } else { vec![0.0; n_inner] };
-    let pose_errors = vec![Vector6::zeros(); views.len()];
-    problem.minimize(CornerState {
-        solution: stage.fit.solution,
-        intrinsics: intrinsics.clone(),
-        joint_offsets,
-        pose_errors,
-    })
 }
 
 fn finish(
@@ -462,7 +283,7 @@ fn finish(
         intrinsics,
         intrinsics_sigma: Vec::new(),
         joint_offsets: Vec::new(),
-        warnings: Vec::new(),
+        intrinsics_doubt: None,
     }
 }
 

@@ -22,4 +22,13 @@ impl Refusal {
     pub(crate) fn new(why: impl Into<String>, motion: impl Into<String>) -> Self {
         Self { why: why.into(), axis: None, motion: motion.into() }
     }
+
+    /// Adds warnings, which may be the cause: wrong samples enlarge the uncertainty, for example.
+    ///
+    /// * `except`: a warning that is reported in another way.
+    pub(super) fn with_warnings(self, warnings: &[String], except: Option<&str>) -> Self {
+        let added = warnings.iter().filter(|warning| Some(warning.as_str()) != except);
+        let why = std::iter::once(&self.why).chain(added).cloned().collect::<Vec<_>>().join("; ");
+        Self { why, ..self }
+    }
 }

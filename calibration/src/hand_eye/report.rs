@@ -6,9 +6,10 @@ use super::geometry;
 use super::mistakes;
 use super::pose_fit::{self, HandEyeNoise, Measurement};
 use super::refine::{self, Refined};
+use super::selection;
 use super::{HandEyeInput, Setup};
-use crate::Error;
 use crate::least_squares::sigma_of;
+use crate::{BoardPoint, Error, PointFit};
 use kinematics::{Intrinsics, Transform};
 use nalgebra::Matrix6;
 
@@ -30,11 +31,12 @@ pub struct HandEyeCalibration {
     pub sigma_deg: [f64; 3],
     /// Scatter of the board over the used samples, with the result of all of them.
     pub scatter: Scatter,
-    /// The same with leave-one-out: each sample is evaluated with a calibration from the others.
+    /// The same for held-out samples: each sample is evaluated with a calibration from others. Leave-one-out, or with more
+    /// than [`MAX_FOLDS`](super::MAX_FOLDS) samples, cross-validation with as many folds.
     pub held_out_scatter: Option<Scatter>,
     /// RMS length of the reprojection error of the used corners, pixels. The robot poses are taken as exact.
     pub rms_px: Option<f64>,
-    /// The same with leave-one-out.
+    /// The same for held-out samples.
     pub held_out_rms_px: Option<f64>,
     /// Estimated measurement errors.
     pub noise: HandEyeNoise,
@@ -88,6 +90,11 @@ pub struct SampleReport {
     pub normalized: Option<f64>,
     /// RMS reprojection error, pixels.
     pub rms_px: Option<f64>,
+    /// Origin of the board according to this sample minus that of the result, millimeters along the axes of the base
+    /// (eye in hand) or the flange (eye to hand).
+    pub board_offset_mm: Option<[f64; 3]>,
+    /// Corners without outliers, with their reprojection errors. Empty for given poses.
+    pub points: Vec<PointFit>,
 }
 
 /// Largest standard deviation of a joint offset that counts as observable, radians or meters.
@@ -146,7 +153,7 @@ impl HeldOut {
         // With corners, the weights were chosen by held-out errors.
         let knows_noise = refined.noise.corner_px.is_some();
         let folds =
-            evaluation::leave_one_out(input.setup, measurements, refined.solution, refined.weighting, knows_noise);
+            evaluation::held_out_solutions(input.setup, measurements, refined.solution, refined.weighting, knows_noise);
         let boards: Option<Vec<Transform>> = folds
             .iter()
             .zip(measurements)
@@ -169,7 +176,7 @@ fn rms_px(
     let used = refined.samples.iter().zip(&refined.choice).zip(&refined.is_inlier).filter(|(_, is_inlier)| **is_inlier);
     let (mut squares, mut n) = (0.0, 0);
     for (used_ix, ((sample, choice), _)) in used.enumerate() {
-        let points = refine::corners(input, sample, *choice);
+        let points = selection::corners(input, sample, *choice);
         squares +=
             evaluation::reprojection_squares(&refine::predicted(&solution(used_ix)?, sample), &points, intrinsics);
         n += points.len();
@@ -188,6 +195,8 @@ fn sample_reports(input: &HandEyeInput<'_>, refined: &Refined, without_board: &[
             rotation_deg: None,
             normalized: None,
             rms_px: None,
+            board_offset_mm: None,
+            points: Vec::new(),
         })
         .collect();
     debug_assert_eq!(refined.samples.len() + without_board.len(), reports.len(), "every sample is usable or not");
@@ -198,11 +207,20 @@ fn sample_reports(input: &HandEyeInput<'_>, refined: &Refined, without_board: &[
         report.rotation_deg = Some(residual.fixed_rows::<3>(0).norm().to_degrees());
         report.position_mm = Some(1e3 * residual.fixed_rows::<3>(3).norm());
         report.normalized = Some((refined.squared_distances[ix] / 6.0).sqrt());
-        let points = refine::corners(input, sample, refined.choice[ix]);
+        let board = sample.a * refined.solution.x * sample.candidates[refined.choice[ix]].camera_from_board;
+        report.board_offset_mm =
+            Some(((board.translation.vector - refined.solution.y.translation.vector) * 1e3).into());
+        let points = selection::corners(input, sample, refined.choice[ix]);
+        let pose = refine::predicted(&refined.solution, sample);
         report.rms_px = refined.intrinsics.as_ref().filter(|_| !points.is_empty()).map(|intrinsics| {
-            let pose = refine::predicted(&refined.solution, sample);
             (evaluation::reprojection_squares(&pose, &points, intrinsics) / points.len() as f64).sqrt()
         });
+        let fit = |point: &BoardPoint| {
+            let in_camera = (pose * nalgebra::Point3::from(point.point_in_board)).coords;
+            let [u, v] = refined.intrinsics.as_ref()?.project(&in_camera)?;
+            Some(PointFit { pixel: point.pixel, residual_px: [point.pixel[0] - u, point.pixel[1] - v] })
+        };
+        report.points = points.iter().filter_map(fit).collect();
     }
     reports
 }
@@ -222,7 +240,7 @@ fn joint_offsets(input: &HandEyeInput<'_>, refined: &Refined) -> Vec<JointOffset
 }
 
 fn warnings(input: &HandEyeInput<'_>, refined: &Refined, reports: &[SampleReport]) -> Vec<String> {
-    let mut warnings = refined.warnings.clone();
+    let mut warnings: Vec<String> = refined.intrinsics_doubt.clone().into_iter().collect();
     let named = |status: SampleStatus| -> Vec<&str> {
         reports.iter().filter(|report| report.status == status).map(|report| report.name.as_str()).collect()
     };

@@ -187,6 +187,57 @@ fn mistakes_are_named() {
 }
 
 #[test]
+fn lists_that_are_off_by_one_are_named() {
+    let scene = Scene::new(Setup::EyeInHand, 12, 0.4, 8);
+    let errors = Errors { board_rad: 1e-3, board_m: 5e-4, ..Errors::default() };
+    for (shift, word) in [(1, "next"), (11, "previous")] {
+        let mut samples = scene.poses(&errors, 3);
+        let poses: Vec<Transform> = samples.iter().map(|sample| sample.base_from_flange).collect();
+        for (ix, sample) in samples.iter_mut().enumerate() {
+            // The pose of sample `ix` moves to sample `ix - shift`, so its image is found `shift` later.
+            sample.base_from_flange = poses[(ix + 12 - shift) % 12];
+        }
+        let text = refusal(&scene.input(samples)).to_string();
+        assert!(text.contains("off by one") && text.contains(word), "{text}");
+    }
+    // Poses in random order are not explained by a shift, nor by the size of the squares.
+    let mut samples = scene.poses(&errors, 3);
+    let poses: Vec<Transform> = samples.iter().map(|sample| sample.base_from_flange).collect();
+    for (ix, sample) in samples.iter_mut().enumerate() {
+        sample.base_from_flange = poses[(5 * ix + 3) % 12];
+    }
+    let text = refusal(&scene.input(samples)).to_string();
+    assert!(!text.contains("off by one") && !text.contains("size of the squares"), "{text}");
+}
+
+#[test]
+fn many_samples_are_held_out_in_groups() {
+    const N: usize = 4 * MAX_FOLDS;
+    let scene = Scene::new(Setup::EyeInHand, N, 0.4, 8);
+    let errors = Errors { board_rad: 1e-3, board_m: 5e-4, ..Errors::default() };
+    let calibration = calibrate_hand_eye(&scene.input(scene.poses(&errors, 3))).unwrap();
+    let held_out = calibration.held_out_scatter.unwrap();
+    // One sample in 60 hardly changes the result.
+    assert!((held_out.mm / calibration.scatter.mm - 1.0).abs() < 0.05, "{held_out:?} {:?}", calibration.scatter);
+    assert!(held_out.mm > calibration.scatter.mm, "held-out samples fit worse");
+}
+
+#[test]
+fn wrong_principal_point_is_named_in_the_refusal() {
+    let scene = Scene::new(Setup::EyeInHand, 15, 0.4, 2);
+    let errors = Errors { corner_px: 0.1, ..Errors::default() };
+    let mut input = scene.input(scene.views(&errors, 5));
+    let mut wrong = scene::intrinsics();
+    wrong.principal_px[0] += 60.0;
+    input.intrinsics = Some(wrong);
+    let text = refusal(&input).to_string();
+    assert!(
+        text.contains("the principal point moves by (-6") || text.contains("the principal point moves by (-5"),
+        "{text}"
+    );
+}
+
+#[test]
 fn degenerate_samples_are_refused() {
     let scene = Scene::new(Setup::EyeInHand, 10, 0.4, 9);
     let samples = scene.poses(&Errors { board_rad: 1e-3, board_m: 5e-4, ..Errors::default() }, 3);

@@ -72,7 +72,7 @@ fn mirrored(camera_from_board: &Transform, points: &[BoardPoint]) -> Transform {
 }
 
 /// Step of a pose: rotation vector in the camera frame about the origin of the target, then translation.
-pub(super) fn moved(camera_from_board: &Transform, step: &Vector6<f64>) -> Transform {
+pub(crate) fn moved(camera_from_board: &Transform, step: &Vector6<f64>) -> Transform {
     let rotation = UnitQuaternion::from_scaled_axis(Vector3::new(step[0], step[1], step[2]));
     let translation = camera_from_board.translation.vector + Vector3::new(step[3], step[4], step[5]);
     Transform::from_parts(Translation3::from(translation), rotation * camera_from_board.rotation)

@@ -17,8 +17,14 @@ pub struct ImageGrid<T> {
 const N_COLUMNS: usize = 16;
 const N_ROWS: usize = 9;
 
-/// Number of corners in each cell.
-pub(super) fn coverage(size_px: [u32; 2], pixels: impl Iterator<Item = [f64; 2]>) -> ImageGrid<usize> {
+impl ImageGrid<usize> {
+    /// Number of corners in each part of an image.
+    pub fn coverage(size_px: [u32; 2], pixels: impl Iterator<Item = [f64; 2]>) -> Self {
+        coverage(size_px, pixels)
+    }
+}
+
+fn coverage(size_px: [u32; 2], pixels: impl Iterator<Item = [f64; 2]>) -> ImageGrid<usize> {
     let mut values = vec![0; N_COLUMNS * N_ROWS];
     for [x, y] in pixels {
         let [width, height] = size_px.map(f64::from);

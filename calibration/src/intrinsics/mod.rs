@@ -2,7 +2,7 @@
 //!
 //! Sources: Zhang 2000 for the approach; OpenCV for the lens models; mrcal for the projection uncertainty.
 
-mod board_pose;
+pub(crate) mod board_pose;
 mod bundle;
 mod check;
 mod coefficients;

@@ -3,7 +3,7 @@
 use super::board_pose::board_pose;
 use super::bundle::Bundle;
 use super::coefficients::Family;
-use super::grid::{self, ImageGrid, ProjectionDerivatives};
+use super::grid::{ImageGrid, ProjectionDerivatives};
 use super::next_view::{self, NextView};
 use super::robust::RobustFit;
 use super::selection::LensTrial;
@@ -232,7 +232,7 @@ pub(super) fn report(
         dispersion: fit.dispersion,
         rejected,
         trials,
-        coverage: grid::coverage(fit.state.intrinsics.size_px, points().map(|point| point.pixel)),
+        coverage: ImageGrid::coverage(fit.state.intrinsics.size_px, points().map(|point| point.pixel)),
         uncertainty_px: derivatives.sigmas_px(&fit.covariance),
         next_view: next_view::suggest(&known, &derivatives, &kept.images()),
         intrinsics: Intrinsics {

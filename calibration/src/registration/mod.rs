@@ -10,6 +10,7 @@
 //! threads.
 
 mod corrections;
+mod covariance;
 mod features;
 mod fit;
 mod layout;
@@ -27,6 +28,7 @@ pub(crate) mod tests;
 mod validation;
 mod view;
 
+pub use covariance::{ExtrinsicsCovariance, PoseSigmas};
 pub use movement::{CameraMovement, MOVEMENT_WINDOW, MovementDetector};
 pub use report::{Alignment, Estimate, PoseEstimate, ScalarEstimate, Unobservable};
 pub use station::{StationCorrection, register_station};
@@ -270,9 +272,16 @@ impl AlignmentScene {
             variant: &variant.corrections,
             noise,
         };
-        let trial = |(baseline_db, variant_db): (Vec<f64>, Vec<f64>)| {
+        let trial = |scores: Vec<validation::ImageScore>| {
+            let gains_db = scores.iter().map(|score| {
+                let camera = self.images[score.image_ix].camera;
+                (&*self.cameras[camera], score.variant_db - score.baseline_db)
+            });
+            let (baseline_db, variant_db): (Vec<f64>, Vec<f64>) =
+                scores.iter().map(|score| (score.baseline_db, score.variant_db)).unzip();
             log::debug!("alignment: {params}: without {baseline_db:.2?}, with {variant_db:.2?} dB");
-            Trial::of(Candidate::Cameras(params), &baseline_db, &variant_db).with_enough_images()
+            let trial = Trial::of(Candidate::Cameras(params), &baseline_db, &variant_db);
+            trial.with_enough_images().with_cameras(gains_db)
         };
         match (params.contains(ParamSet::IMAGE_POSES), baseline.set.contains(ParamSet::IMAGE_POSES)) {
             (true, _) => trial(comparison.scores_with_free_poses()),

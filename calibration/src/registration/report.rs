@@ -1,6 +1,7 @@
 //! Results of alignment, as data and as text.
 
 use super::corrections::rotation_and_translation;
+use super::covariance::ExtrinsicsCovariance;
 use super::fit::Fit;
 use super::layout::CalibrationParam;
 use super::movement::CameraMovement;
@@ -32,6 +33,9 @@ pub struct Alignment {
     /// `corrections`.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub movements: Vec<CameraMovement>,
+    /// Uncertainty of the extrinsics, if they were estimated. It is not saved.
+    #[serde(skip)]
+    pub extrinsics_covariance: Option<ExtrinsicsCovariance>,
 }
 
 /// One estimated correction. Each sigma is a standard deviation.
@@ -159,7 +163,17 @@ pub(super) fn alignment(
         .zip(&kept.corrections.by_camera)
         .map(|(name, correction)| (name.to_string(), correction.clone()));
     let corrections = if kept.set.is_empty() { BTreeMap::new() } else { corrections.collect() };
-    Alignment { corrections, estimates, unobservable, trials, n_pairs: scene.pairs.len(), movements: Vec::new() }
+    let extrinsics_covariance =
+        kept.fit.as_ref().and_then(|fit| ExtrinsicsCovariance::of(scene, &fit.layout.params, &fit.solution));
+    Alignment {
+        corrections,
+        estimates,
+        unobservable,
+        trials,
+        n_pairs: scene.pairs.len(),
+        movements: Vec::new(),
+        extrinsics_covariance,
+    }
 }
 
 /// The estimate of the group of parameters that starts with a parameter; `None` if the parameter is not the first of

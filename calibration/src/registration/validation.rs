@@ -35,10 +35,25 @@ pub(super) struct PairedComparison<'a> {
 /// Number of samples, and sums of squared residuals of the baseline and the variant.
 type PairedErrors = (usize, f64, f64);
 
+/// PSNR of one validation image.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct ImageScore {
+    pub(super) image_ix: usize,
+    pub(super) baseline_db: f64,
+    pub(super) variant_db: f64,
+}
+
+impl ImageScore {
+    fn new(image_ix: usize, errors: PairedErrors) -> Self {
+        let (baseline_db, variant_db) = psnr(errors);
+        Self { image_ix, baseline_db, variant_db }
+    }
+}
+
 impl PairedComparison<'_> {
     /// PSNR in dB of each validation image for baseline and variant, at the same samples.
-    pub(super) fn scores(&self) -> (Vec<f64>, Vec<f64>) {
-        scores(self.images, self.pairs, &self.views(), self.noise, |pair| pair.to)
+    pub(super) fn scores(&self) -> Vec<ImageScore> {
+        image_scores(self.images, self.pairs, &self.views(), self.noise, |pair| pair.to)
     }
 
     /// Like [`Self::scores`], but each validation image gets an individual pose, estimated on one half of its blocks
@@ -50,7 +65,7 @@ impl PairedComparison<'_> {
     /// show. Both therefore have the same freedom, overfitting to noise lowers the score on the other half, and the
     /// accuracy of the validation image's own pose does not matter. The correction itself was not estimated from
     /// these images.
-    pub(super) fn scores_with_free_poses(&self) -> (Vec<f64>, Vec<f64>) {
+    pub(super) fn scores_with_free_poses(&self) -> Vec<ImageScore> {
         let views = self.views();
         let mut by_image: BTreeMap<usize, Vec<Pair>> = BTreeMap::new();
         for pair in self.pairs {
@@ -76,9 +91,9 @@ impl PairedComparison<'_> {
         let score_of = |(to, pairs): &(usize, Vec<Pair>)| {
             let mut sum = errors_on_half(*to, pairs, false)?;
             add_errors(&mut sum, errors_on_half(*to, pairs, true)?);
-            (sum.0 > MIN_SAMPLES).then(|| psnr(sum))
+            (sum.0 > MIN_SAMPLES).then(|| ImageScore::new(*to, sum))
         };
-        images.par_iter().filter_map(score_of).collect::<Vec<_>>().into_iter().unzip()
+        images.par_iter().filter_map(score_of).collect()
     }
 
     fn views(&self) -> [Vec<CorrectedView>; 2] {
@@ -96,6 +111,18 @@ pub(super) fn scores(
     noise: Noise,
     validation_image_of: impl Fn(&Pair) -> usize + Sync,
 ) -> (Vec<f64>, Vec<f64>) {
+    let scores = image_scores(images, pairs, views, noise, validation_image_of);
+    scores.into_iter().map(|score| (score.baseline_db, score.variant_db)).unzip()
+}
+
+/// [`scores`] with the indices of the images.
+fn image_scores(
+    images: &[PreparedImage],
+    pairs: &[Pair],
+    views: &[Vec<CorrectedView>; 2],
+    noise: Noise,
+    validation_image_of: impl Fn(&Pair) -> usize + Sync,
+) -> Vec<ImageScore> {
     let score_of = |pair: &Pair| {
         let sides = [0, 1].map(|ix: usize| sums::sides(images, &views[ix], *pair));
         (validation_image_of(pair), errors(sides, noise, PixelSubset::All))
@@ -105,7 +132,7 @@ pub(super) fn scores(
     for (validation_ix, errors) in errors.into_iter().filter(|(_, (n, ..))| *n > MIN_SAMPLES) {
         add_errors(by_image.entry(validation_ix).or_default(), errors);
     }
-    by_image.into_values().map(psnr).unzip()
+    by_image.into_iter().map(|(image_ix, errors)| ImageScore::new(image_ix, errors)).collect()
 }
 
 /// Gain of the prediction of an image if its view is replaced, dB; `None` if too few samples are visible. All pairs

@@ -3,6 +3,7 @@
 //! The magnitude of the rotation rate of rigidly joined bodies is the same in every frame (Furrer et al. 2017, "Evaluation
 //! of combined time-offset estimation and hand-eye calibration on robotic datasets").
 
+use super::stamps;
 use super::stream::Stream;
 use crate::hand_eye::Refusal;
 
@@ -21,28 +22,22 @@ pub(super) struct Coarse {
 /// # Errors
 /// If the streams have no rotation, or no significant correlation.
 pub(super) fn correlate(a: &Stream, b: &Stream, max_offset_secs: Option<f64>) -> Result<Vec<Coarse>, Refusal> {
-    const MAX_POINTS: f64 = 4000.0;
-    const MIN_OVERLAP: f64 = 0.25;
     /// Lower maxima are not tried.
     const SIMILAR: f64 = 0.7;
     const MAX_OTHERS: usize = 4;
-    let durations = [a, b].map(|stream| stream.end_secs() - stream.start_secs());
-    let finest = a.step_secs().max(b.step_secs());
-    let step_secs = finest.max(durations[0].max(durations[1]) / MAX_POINTS);
-    let window_secs = 2.0 * step_secs;
-    let (rates_a, rates_b) = (Rates::new(a, step_secs, window_secs), Rates::new(b, step_secs, window_secs));
-    for (name, rates) in [("A", &rates_a), ("B", &rates_b)] {
+    for (name, stream) in [("A", a), ("B", b)] {
+        let own = Grid::new(stream, stream);
+        if let (Some(refusal), Err(_)) =
+            (stamps::unit_mistake(name, stream.median_step_secs()), own.rates[0].check_excitation(name))
+        {
+            return Err(refusal);
+        }
+    }
+    let grid = Grid::new(a, b);
+    for (name, rates) in [("A", &grid.rates[0]), ("B", &grid.rates[1])] {
         rates.check_excitation(name)?;
     }
-    let (n_a, n_b) = (signed(rates_a.values.len()), signed(rates_b.values.len()));
-    let min_overlap = (MIN_OVERLAP * n_a.min(n_b) as f64).max(10.0);
-    let base_secs = a.start_secs() - b.start_secs();
-    // Without a limit, clocks with different zeros are allowed, as long as the recordings overlap.
-    let offset_at = |lag: i64| base_secs + lag as f64 * step_secs;
-    let correlations: Vec<Correlation> = (-n_b..=n_a)
-        .filter(|lag| max_offset_secs.is_none_or(|most| offset_at(*lag).abs() <= most))
-        .filter_map(|lag| Correlation::new(&rates_a, &rates_b, lag, min_overlap))
-        .collect();
+    let correlations = grid.correlations(max_offset_secs);
     let Some(best) = correlations.iter().max_by(|p, q| p.significance.total_cmp(&q.significance)) else {
         return Err(Refusal::new(
             "the streams do not overlap in the allowed range of offsets",
@@ -50,6 +45,9 @@ pub(super) fn correlate(a: &Stream, b: &Stream, max_offset_secs: Option<f64>) ->
         ));
     };
     if best.value < MIN_CORRELATION {
+        if let Some(refusal) = clock_rate_mistake(a, b) {
+            return Err(refusal);
+        }
         return Err(Refusal::new(
             format!(
                 "the rotation rates of the streams are not correlated (at most {:.2}; at least {MIN_CORRELATION} is needed)",
@@ -63,16 +61,66 @@ pub(super) fn correlate(a: &Stream, b: &Stream, max_offset_secs: Option<f64>) ->
         .into_iter()
         .chain(others.into_iter().filter(|other| other.value > SIMILAR * best.value).take(MAX_OTHERS))
         .map(|correlation| correlation.lag);
-    Ok(lags.map(|lag| Coarse { offset_secs: offset_at(lag), step_secs }).collect())
+    Ok(lags.map(|lag| Coarse { offset_secs: grid.offset_secs(lag), step_secs: grid.step_secs }).collect())
+}
+
+/// Explanation by stamps that advance too fast or too slowly by a factor of two.
+pub(super) fn clock_rate_mistake(a: &Stream, b: &Stream) -> Option<Refusal> {
+    /// Unrelated motions of usual length do not reach it.
+    const MIN_CORRELATION: f64 = 0.7;
+    let correlation = |factor: f64| {
+        let correlations = Grid::new(a, &b.scaled(factor)).correlations(None);
+        correlations.iter().map(|correlation| correlation.value).fold(0.0, f64::max)
+    };
+    let words =
+        [(0.5, "twice"), (2.0, "half")].into_iter().find(|(factor, _)| correlation(*factor) > MIN_CORRELATION)?.1;
+    Some(Refusal::new(
+        format!("the stamps of stream B advance {words} as fast as those of stream A: only then do the motions agree"),
+        "check how the stamps were computed, for example from a frame number and a wrong frame rate",
+    ))
 }
 
 fn signed(n: usize) -> i64 {
     i64::try_from(n).unwrap_or(i64::MAX / 2)
 }
 
+/// Rotation rates of both streams at the same intervals.
+pub(super) struct Grid {
+    pub(super) rates: [Rates; 2],
+    pub(super) step_secs: f64,
+    /// Offset without a lag.
+    base_secs: f64,
+}
+
+impl Grid {
+    pub(super) fn new(a: &Stream, b: &Stream) -> Self {
+        const MAX_POINTS: f64 = 4000.0;
+        let durations = [a, b].map(|stream| stream.end_secs() - stream.start_secs());
+        let finest = a.step_secs().max(b.step_secs());
+        let step_secs = finest.max(durations[0].max(durations[1]) / MAX_POINTS);
+        let rates = [a, b].map(|stream| Rates::new(stream, step_secs, 2.0 * step_secs));
+        Self { rates, step_secs, base_secs: a.start_secs() - b.start_secs() }
+    }
+
+    /// Correlations at all lags with enough overlap. Without a limit, clocks with different zeros are allowed.
+    pub(super) fn correlations(&self, max_offset_secs: Option<f64>) -> Vec<Correlation> {
+        const MIN_OVERLAP: f64 = 0.25;
+        let [n_a, n_b] = self.rates.each_ref().map(|rates| signed(rates.values.len()));
+        let min_overlap = (MIN_OVERLAP * n_a.min(n_b) as f64).max(10.0);
+        (-n_b..=n_a)
+            .filter(|lag| max_offset_secs.is_none_or(|most| self.offset_secs(*lag).abs() <= most))
+            .filter_map(|lag| Correlation::new(&self.rates[0], &self.rates[1], lag, min_overlap))
+            .collect()
+    }
+
+    pub(super) fn offset_secs(&self, lag: i64) -> f64 {
+        self.base_secs + lag as f64 * self.step_secs
+    }
+}
+
 /// Rotation rates on a regular grid; `None` in gaps.
-struct Rates {
-    values: Vec<Option<f64>>,
+pub(super) struct Rates {
+    pub(super) values: Vec<Option<f64>>,
 }
 
 impl Rates {
@@ -116,9 +164,9 @@ impl Rates {
 }
 
 /// Correlation at one lag.
-struct Correlation {
-    lag: i64,
-    value: f64,
+pub(super) struct Correlation {
+    pub(super) lag: i64,
+    pub(super) value: f64,
     /// Value of the t statistic, which weighs long overlaps.
     significance: f64,
 }

@@ -21,6 +21,8 @@ pub(super) struct Fine {
     pub(super) mid_secs: f64,
     /// RMS rotation residual, radians.
     pub(super) rms_rad: f64,
+    /// Rotation residuals: seconds on B's clock, radians.
+    pub(super) residuals: Vec<[f64; 2]>,
     /// Deviation of the residuals per axis from their median, radians.
     pub(super) median_rad: f64,
     /// RMS rotation of B from its mean orientation, radians.
@@ -52,6 +54,7 @@ pub(super) fn refine(a: &Stream, b: &Stream, offset_secs: f64) -> Result<Fine, E
         drift: is_significant.then_some([drift, drift_sigmas[DRIFT_IX]]),
         mid_secs: problem.mid_secs,
         rms_rad: problem.rms_rad(&fit.state),
+        residuals: problem.residuals_over_time(&fit.state),
         median_rad: problem.median_rad(&fit.state),
         motion_rad: problem.motion_rad(),
     })
@@ -165,6 +168,13 @@ impl<'a> Orientations<'a> {
 
     fn residuals(&self, state: &State) -> impl Iterator<Item = Vector3<f64>> {
         self.times_b.iter().filter_map(|(secs, in_b)| self.residual(state, *secs, in_b).map(|found| found.0))
+    }
+
+    fn residuals_over_time(&self, state: &State) -> Vec<[f64; 2]> {
+        let residual = |(secs, in_b): &(f64, UnitQuaternion<f64>)| {
+            self.residual(state, *secs, in_b).map(|(residual, _)| [*secs, residual.norm()])
+        };
+        self.times_b.iter().filter_map(residual).collect()
     }
 
     /// Standard deviation per axis from the median of the norms.

@@ -5,9 +5,13 @@
 
 mod coarse;
 mod fine;
+mod profile;
+mod stamps;
 mod stream;
 #[cfg(test)]
 mod tests;
+
+pub use profile::{MotionProfile, motion_profile};
 
 use crate::Error;
 use crate::hand_eye::{
@@ -56,6 +60,8 @@ pub struct TimeOffset {
     pub mid_secs: f64,
     /// RMS difference of the orientations after alignment, degrees.
     pub rms_deg: f64,
+    /// Differences of the orientations after alignment over time: seconds on B's clock, degrees.
+    pub residuals: Vec<[f64; 2]>,
     /// The transform between the bodies, or why it is refused. `None` if it was not asked for.
     pub hand_eye: Option<Result<BodyTransform, Refusal>>,
 }
@@ -109,7 +115,10 @@ pub fn estimate_time_offset(
     let is_swapped = b.step_secs() < a.step_secs();
     let (interpolated, points) = if is_swapped { (&b, &a) } else { (&a, &b) };
     let sign = if is_swapped { -1.0 } else { 1.0 };
-    let (coarse, fine) = refine_best(interpolated, points, &coarse, sign)?;
+    let (coarse, fine) = refine_best(interpolated, points, &coarse, sign).map_err(|error| match &error {
+        Error::Refused(_) => coarse::clock_rate_mistake(&a, &b).map_or(error, refused),
+        _ => error,
+    })?;
     let offset_secs = sign * fine.offset_secs;
     if (offset_secs - coarse.offset_secs).abs() > 10.0 * coarse.step_secs {
         return Err(refused(Refusal::new(
@@ -135,12 +144,15 @@ pub fn estimate_time_offset(
     let mid_secs = if is_swapped { fine.mid_secs + fine.offset_secs } else { fine.mid_secs };
     let drift = fine.drift.map_or(0.0, |[drift, _]| sign * drift);
     let secs_a = |secs_b: f64| secs_b + offset_secs + drift * (secs_b - mid_secs);
+    let secs_b = |secs: f64| if is_swapped { secs + fine.offset_secs } else { secs };
+    let residuals = fine.residuals.iter().map(|[secs, rad]| [secs_b(*secs), rad.to_degrees()]).collect();
     Ok(TimeOffset {
         offset_secs,
         sigma_secs: fine.sigma_secs,
         drift_ppm: fine.drift.map(|[drift, sigma]| [1e6 * sign * drift, 1e6 * sigma]),
         mid_secs,
         rms_deg: fine.rms_rad.to_degrees(),
+        residuals,
         hand_eye: options.hand_eye.then(|| body_transform(&a, &b, secs_a)).transpose()?,
     })
 }

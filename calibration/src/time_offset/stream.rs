@@ -1,6 +1,6 @@
 //! A stream of poses as a function of time.
 
-use super::PoseSample;
+use super::{PoseSample, stamps};
 use crate::Error;
 use kinematics::{Transform, transform};
 use nalgebra::Vector3;
@@ -35,6 +35,9 @@ impl Stream {
         }
         let mut sorted = samples.to_vec();
         sorted.sort_by(|a, b| a.secs.total_cmp(&b.secs));
+        if let Some(why) = stamps::repeated_stamps(name, &sorted) {
+            return invalid(why);
+        }
         sorted.dedup_by(|later, earlier| later.secs <= earlier.secs);
         if sorted.len() < MIN_POSES {
             return invalid(format!(
@@ -45,6 +48,22 @@ impl Stream {
         let steps: Vec<f64> = sorted.windows(2).map(|pair| pair[1].secs - pair[0].secs).collect();
         let step_secs = kinematics::quantile::median(&steps).unwrap_or(0.0);
         Ok(Self { samples: sorted, max_gap_secs: GAP * step_secs })
+    }
+
+    pub(super) fn median_step_secs(&self) -> f64 {
+        let steps: Vec<f64> = self.samples.windows(2).map(|pair| pair[1].secs - pair[0].secs).collect();
+        kinematics::quantile::median(&steps).unwrap_or(0.0)
+    }
+
+    /// The stream on a clock that advances by another factor.
+    pub(super) fn scaled(&self, factor: f64) -> Self {
+        let first_secs = self.start_secs();
+        let mut scaled = self.clone();
+        scaled.max_gap_secs *= factor;
+        for sample in &mut scaled.samples {
+            sample.secs = first_secs + factor * (sample.secs - first_secs);
+        }
+        scaled
     }
 
     pub(super) fn start_secs(&self) -> f64 {

@@ -183,3 +183,41 @@ fn hand_eye_of_an_arm_that_rotates_about_one_axis_is_refused() {
     let refusal = found.hand_eye.unwrap().unwrap_err();
     assert!(refusal.why.contains("all rotations are around") && refusal.axis.is_some(), "{refusal}");
 }
+
+#[test]
+fn stamps_in_other_units_are_named() {
+    for (unit, factor) in [("milliseconds", 1e3), ("microseconds", 1e6), ("nanoseconds", 1e9)] {
+        for scales_b in [false, true] {
+            let (mut a, mut b) = streams(1, 1e-3, 0.0);
+            let (scaled, name) = if scales_b { (&mut b, "stream B") } else { (&mut a, "stream A") };
+            scaled.iter_mut().for_each(|sample| sample.secs *= factor);
+            let text = message(&a, &b);
+            assert!(text.contains(unit) && text.contains(name) && text.contains("divide"), "{text}");
+        }
+        let (mut a, mut b) = streams(1, 1e-3, 0.0);
+        a.iter_mut().chain(&mut b).for_each(|sample| sample.secs *= factor);
+        assert!(message(&a, &b).contains(unit));
+    }
+}
+
+#[test]
+fn stamps_that_advance_at_another_rate_or_repeat_are_named() {
+    let (a, b) = streams(1, 1e-3, 0.0);
+    let mut twice = b.clone();
+    twice.iter_mut().for_each(|sample| sample.secs *= 2.0);
+    let text = message(&a, &twice);
+    assert!(text.contains("twice as fast"), "{text}");
+    // Whole seconds.
+    let mut rounded = b.clone();
+    rounded.iter_mut().for_each(|sample| sample.secs = sample.secs.floor());
+    let text = message(&a, &rounded);
+    assert!(text.contains("stream B") && text.contains("whole seconds"), "{text}");
+    // Rows that are repeated exactly do no harm.
+    let repeated: Vec<PoseSample> = b.iter().flat_map(|sample| [*sample, *sample]).collect();
+    let found = estimate_time_offset(&a, &repeated, &TimeOffsetOptions::default()).unwrap();
+    assert!((found.offset_secs - TRUE_OFFSET_SECS).abs() < 0.005, "{}", found.offset_secs);
+}
+
+fn message(a: &[PoseSample], b: &[PoseSample]) -> String {
+    estimate_time_offset(a, b, &TimeOffsetOptions::default()).unwrap_err().to_string()
+}

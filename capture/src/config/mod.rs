@@ -28,7 +28,7 @@ pub use error::{ConfigError, SourceLocation};
 pub use join::JoinConfig;
 pub use motion::ArmMotion;
 pub use scanner::{Scanner, ScannerDriver, ScannerSim};
-pub use sim::Sim;
+pub use sim::{Sim, SimTarget};
 pub use train::{DEFAULT_SEED, MAX_BYTES_RANGE, MAX_SPLATS_RANGE, Methods, SEED_RANGE, Train};
 
 use std::path::{Path, PathBuf};

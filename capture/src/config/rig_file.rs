@@ -2,7 +2,7 @@
 
 use super::key::entry;
 use super::section::{ParseContext, Section};
-use super::{ConfigError, Override, Rig, arm, base, camera, scanner};
+use super::{ConfigError, Override, Rig, arm, base, camera, scanner, sim};
 use toml::{Table, Value};
 
 /// Robot description of a rig without an arm, if the rig file names none.
@@ -55,7 +55,7 @@ fn rig(mut root: Section<'_>) -> Option<(Rig, String)> {
     let scanners: Vec<_> = scanners.into_iter().map(|(name, keys)| scanner::read(&name, keys)).collect();
     let join = root.get_optional("join", ());
     let train = root.get_optional("train", ());
-    let sim = root.get_optional("sim", ());
+    let sim = sim::read(root.section("sim"));
     root.end();
     let (arm, urdf_path) = arm?;
     let cameras = cameras.into_iter().collect::<Option<_>>()?;
@@ -88,8 +88,9 @@ pub(super) fn write(rig: &Rig) -> String {
         ("base", base::write(&rig.base)),
         ("camera", cameras.collect()),
         ("range", scanners.collect()),
+        ("sim", sim::write(&rig.sim)),
     ];
     let mut file: Table = tables.into_iter().map(|(key, table)| (key.to_owned(), Value::Table(table))).collect();
-    file.extend(entry("join", &rig.join).into_iter().chain(entry("train", &rig.train)).chain(entry("sim", &rig.sim)));
+    file.extend(entry("join", &rig.join).into_iter().chain(entry("train", &rig.train)));
     toml::to_string(&file).expect("tables of numbers and texts always serialize")
 }

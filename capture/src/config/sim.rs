@@ -1,7 +1,11 @@
 //! The keys in `[sim]`.
 
-use super::key::keys;
+use super::key::{Keys, entry, keys};
+use super::section::Section;
 use super::train::{DEFAULT_SEED, SEED_RANGE};
+use kinematics::Transform;
+use std::collections::BTreeMap;
+use toml::{Table, Value};
 
 keys! {
     /// Settings of the simulator, which is used with `--sim` and by drivers named `sim`.
@@ -30,5 +34,37 @@ keys! {
         /// Brightness of the lights while a camera on the flange is inside the cabinet, relative to their brightness
         /// otherwise.
         pub light_inside_frac: f64 = 1.0, in 0.0..=4.0;
+        /// Printed calibration targets in the scene, by name.
+        pub targets: BTreeMap<String, SimTarget> => BTreeMap::new();
     }
+
+    /// The keys in `[sim.target.NAME]`.
+    #[derive(Clone, Debug, PartialEq)]
+    pub struct SimTarget {
+        /// Specification of the target. The simulator checks it.
+        pub spec: String, required "the target, such as \"charuco:5x7:34mm:26mm:5X5_100\"";
+        /// Pose of the board frame: x points right on the print, y down, z into the board.
+        pub world_from_board: Transform = Transform::identity();
+    }
+}
+
+pub(super) fn read(mut keys: Section<'_>) -> Option<Sim> {
+    let mut sim = Sim::read_keys(&mut keys)?;
+    let named = keys.named_sections("target").into_iter().map(|(name, keys)| {
+        keys.check_name(&name);
+        Some((name, keys.read()?))
+    });
+    let targets = named.collect::<Vec<_>>();
+    keys.end();
+    sim.targets = targets.into_iter().collect::<Option<_>>()?;
+    Some(sim)
+}
+
+pub(super) fn write(sim: &Sim) -> Table {
+    let mut table = sim.write_keys();
+    if !sim.targets.is_empty() {
+        let targets = sim.targets.iter().filter_map(|(name, target)| entry(name, target));
+        table.insert("target".to_owned(), Value::Table(targets.collect()));
+    }
+    table
 }

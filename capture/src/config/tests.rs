@@ -67,6 +67,8 @@ parent_from_camera = { xyz_m = [0.0, 0.0, 0.1], quat_xyzw = [0.0, 0.0, 0.0, 1.0]
 intrinsics = { focal_px = [600, 600], principal_px = [320.0, 240.0], lens = "brown_conrady", distortion = [0, 0, 0, 0, 0] }
 camera_from_depth = { xyz_m = [0.0, 0.0, 0.1], quat_xyzw = [0.0, 0.0, 0.0, 1.0] }
 [arm.sim]
+[sim.target.board]
+spec = "charuco:5x7:34mm:26mm:5X5_100"
 "#;
 
 fn parse(text: &str, overrides: &[Override]) -> Result<Rig, ConfigError> {
@@ -79,7 +81,7 @@ fn with(key: &'static str, value: &str) -> Result<Rig, ConfigError> {
 }
 
 /// Key, a valid value that differs from the current one, and an invalid value.
-const KEYS: [(&str, &str, &str); 176] = [
+const KEYS: [(&str, &str, &str); 179] = [
     ("arm.rate_hz", "500", "0"),
     ("arm.bus.can0.bitrate_hz", "500_000", "1"),
     ("arm.bus.can0.data_bitrate_hz", "5_000_000", "9_000_000"),
@@ -250,6 +252,9 @@ const KEYS: [(&str, &str, &str); 176] = [
     ("sim.truth", "false", "0"),
     ("sim.truth_depth", "true", "0"),
     ("sim.light_inside_frac", "0.5", "-1"),
+    ("sim.target.board.spec", "'tag:36h11:5:100mm'", "5"),
+    ("sim.target.board.world_from_board.xyz_m", "[1, 2, 3]", "[1, 2]"),
+    ("sim.target.board.world_from_board.quat_xyzw", "[0, 1, 0, 0]", "[0, 0, 0, 0]"),
     // The same settings as whole tables: a flag may also replace a table.
     ("base.world_from_base", "{ xyz_m = [1, 2, 3] }", "3"),
     ("range.lidar.base_from_scanner", "{ xyz_m = [1, 2, 3] }", "3"),
@@ -312,7 +317,7 @@ fn documentation_lists_exactly_the_existing_keys() {
     let tested: BTreeSet<String> = KEYS
         .iter()
         .map(|(key, ..)| {
-            let names = ["camera.wrist", "range.lidar", "arm.bus.can0", "base.tag.7"];
+            let names = ["camera.wrist", "range.lidar", "arm.bus.can0", "base.tag.7", "sim.target.board"];
             let motors = ["arm.motor.first", "arm.motor.second", "arm.motor.third"];
             names.iter().chain(&motors).fold((*key).to_owned(), |key, named| {
                 let (table, _) = named.rsplit_once('.').expect("two parts");

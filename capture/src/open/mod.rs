@@ -91,6 +91,7 @@ pub fn rig(mut rig: Rig, devices: Devices) -> crate::Result<Opened> {
             camera.driver = CameraDriver::Sim;
         }
     }
+    without_readout_if_ideal(&mut rig);
     if let Some(device) = unsupported_device(&rig) {
         bail!("{device} cannot be opened by this version; {SIM_HINT}");
     }
@@ -134,6 +135,7 @@ pub fn recording(path: &Path, rig: Option<Rig>, overrides: &[Override]) -> crate
         rig.arm.joints = recorded.to_vec();
     }
     check_intrinsics(&rig)?;
+    without_readout_if_ideal(&mut rig);
     let damage = Arc::default();
     let source = Box::new(RecordingSource { recording, damage: Arc::clone(&damage) });
     Ok(Opened { rig, source, damage, stamp_clock: StampClock::Unrelated })
@@ -171,6 +173,14 @@ fn stored_rig(path: &Path, recording: &Recording, overrides: &[Override]) -> cra
         std::str::from_utf8(bytes).with_context(|| format!("the recording {path:?}: {name} is not text"))
     };
     Ok(Rig::parse(RIG_FILE, text(RIG_FILE)?, text(URDF_FILE)?, overrides)?)
+}
+
+/// Sets the readout time of simulated cameras without imperfections to 0: they expose all rows at once.
+fn without_readout_if_ideal(rig: &mut Rig) {
+    let is_ideal = rig.sim.ideal;
+    for camera in rig.cameras.iter_mut().filter(|camera| is_ideal && camera.driver == CameraDriver::Sim) {
+        camera.readout_micros = Some(0.0);
+    }
 }
 
 /// Checks that the rig has an arm if a camera is on the flange.

@@ -1,6 +1,6 @@
 //! Opens the simulated twin of a rig: the same cameras and joints in MuJoCo.
 
-use crate::config::{BaseDriver, Camera, CameraDriver, Depth, Parent, Rig, Scanner, ScannerDriver};
+use crate::config::{BaseDriver, Camera, CameraDriver, Depth, Parent, Rig, Scanner, ScannerDriver, SimTarget};
 use drivers::{Devices, Error, Live, Sample, Source};
 use keyframe::bail;
 use kinematics::{Intrinsics, Stamp, Transform};
@@ -102,8 +102,14 @@ fn config_of(rig: &Rig) -> crate::Result<sim::Config> {
             drift_rad: rig.base.sim.drift_rad,
         },
         light_inside_frac: rig.sim.light_inside_frac,
+        targets: rig.sim.targets.iter().map(target_of).collect(),
         cameras: rig.cameras.iter().filter(|camera| camera.driver == CameraDriver::Sim).map(camera_of).collect(),
     })
+}
+
+fn target_of((name, target): (&String, &SimTarget)) -> sim::TargetConfig {
+    let SimTarget { spec, world_from_board } = target.clone();
+    sim::TargetConfig { name: format!("sim.target.{name}"), spec, world_from_board }
 }
 
 fn scanner_of(scanner: &Scanner) -> sim::ScannerConfig {

@@ -46,7 +46,7 @@ pub struct Line {
 pub struct Point {
     /// Position on the horizontal axis.
     pub x: f64,
-    /// Position on the vertical axis.
+    /// Position on the vertical axis; the line is interrupted where it is not finite.
     pub y: f64,
     /// Lower end of the band around the line.
     pub low: f64,
@@ -243,6 +243,8 @@ fn draw_legend(legend: &[Entry], plot: &Plot, shapes: &mut Vec<VectorShape>) {
     }
 }
 
+/// Lines with more points are thinner and have no dots, which would hide the line.
+const MAX_DOTS: usize = 100;
 const PEER_DASH: [f64; 2] = [6.0, 3.0];
 
 fn color_of(line_ix: usize) -> Color {
@@ -250,7 +252,7 @@ fn color_of(line_ix: usize) -> Color {
 }
 
 fn draw_band(line: &Line, color: Color, plot: &Plot, shapes: &mut Vec<VectorShape>) {
-    if line.points.len() < 2 || line.points.iter().all(|point| point.low == point.high) {
+    if line.points.len() < 2 || line.points.iter().all(|point| point.low == point.high || !point.y.is_finite()) {
         return;
     }
     let above = line.points.iter().map(|point| [plot.x(point.x), plot.y(point.high)]);
@@ -258,14 +260,19 @@ fn draw_band(line: &Line, color: Color, plot: &Plot, shapes: &mut Vec<VectorShap
     shapes.push(VectorShape::Area { points: above.chain(below).collect(), color, opacity_frac: 0.2 });
 }
 
+/// Draws a line, with gaps at points that are not finite.
 fn draw_line(line: &Line, ix: usize, plot: &Plot, shapes: &mut Vec<VectorShape>) {
-    let points: Vec<[f64; 2]> = line.points.iter().map(|point| plot.at(point)).collect();
     let dash = line.is_peer.then_some(PEER_DASH);
-    if points.len() > 1 {
-        shapes.push(VectorShape::Line { points: points.clone(), color: color_of(ix), width: 2.0, dash });
-    }
-    for at in points {
-        draw_dot(at, ix, shapes);
+    let is_dense = line.points.len() > MAX_DOTS;
+    let width = if is_dense { 1.4 } else { 2.0 };
+    for part in line.points.split(|point| !point.y.is_finite()) {
+        let points: Vec<[f64; 2]> = part.iter().map(|point| plot.at(point)).collect();
+        if points.len() > 1 {
+            shapes.push(VectorShape::Line { points: points.clone(), color: color_of(ix), width, dash });
+        }
+        if !is_dense {
+            points.into_iter().for_each(|at| draw_dot(at, ix, shapes));
+        }
     }
 }
 

@@ -2,6 +2,7 @@
 
 mod ablation;
 mod budget;
+mod calibration;
 mod curve;
 mod field;
 mod kernels;
@@ -38,6 +39,8 @@ enum BenchCommand {
     Stability(stability::Args),
     /// Errors of image stamps with jitter and clock drift, as a histogram
     Stamps(stamps::Args),
+    /// Accuracy, stated uncertainty, speed and limits of calibration with and without a target
+    Calibration(calibration::Args),
     /// Live runs with viewers: latency of pictures, time from shutter to model, and PSNR over time with right and wrong
     /// calibration
     Live(live::Args),
@@ -54,6 +57,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         BenchCommand::Ablation(args) => ablation::run(args),
         BenchCommand::Stability(args) => stability::run(args),
         BenchCommand::Stamps(args) => stamps::run(args),
+        BenchCommand::Calibration(args) => calibration::run(args),
         BenchCommand::Live(args) => live::run(args),
         BenchCommand::Memory(args) => memory::run(args),
     }

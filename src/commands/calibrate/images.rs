@@ -1,9 +1,9 @@
-//! Reads image files and detects a target in them.
+//! Reads image files, and detects a target in images.
 
 use crate::exit::BadArgument;
 use crate::print;
-use anyhow::Context;
 use calibration::{BoardPoint, BoardView};
+use session::calibration_report::{Photo, Photos, Unused};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use targets::{Detection, GrayImage, TargetSpec};
@@ -11,10 +11,10 @@ use targets::{Detection, GrayImage, TargetSpec};
 /// The target in one image.
 #[derive(Debug)]
 pub(super) struct DetectedImage {
-    /// Name of the file.
+    /// Name of the file, or time in the recording.
     pub(super) name: String,
     /// The target, or the reason why it was not found.
-    pub(super) board: Result<Board, String>,
+    pub(super) board: Result<Board, NoBoard>,
 }
 
 /// The target in an image of known size.
@@ -24,48 +24,91 @@ pub(super) struct Board {
     pub(super) view: BoardView,
 }
 
+/// Why an image has no target.
+#[derive(Debug, thiserror::Error)]
+pub(super) enum NoBoard {
+    /// The file is not an image, or damaged.
+    #[error("cannot read the image: {0}")]
+    Unreadable(String),
+    /// The image can be read but does not show the target.
+    #[error(transparent)]
+    NotDetected(#[from] targets::NotDetected),
+}
+
+/// An image file and the name that messages use for it.
+#[derive(Clone, Debug)]
+pub(super) struct ImageFile {
+    pub(super) name: String,
+    pub(super) path: PathBuf,
+}
+
 /// Extensions of the image files in a folder that are read.
 const EXTENSIONS: [&str; 3] = ["jpg", "jpeg", "png"];
 
 /// The image files in a folder, in order of their names.
-pub(super) fn files(folder: &Path) -> anyhow::Result<Vec<PathBuf>> {
+pub(super) fn files(folder: &Path) -> Result<Vec<ImageFile>, BadArgument> {
     if folder.is_file() {
-        return Err(BadArgument(format!("{} is a file, expected a folder of images", folder.display())).into());
+        return Err(BadArgument(format!("{} is a file, expected a folder of images", folder.display())));
     }
-    let in_folder = || format!("cannot read the folder {}", folder.display());
+    let unreadable =
+        |error: std::io::Error| BadArgument(format!("cannot read the folder {}: {error}", folder.display()));
     let mut files = Vec::new();
-    for entry in std::fs::read_dir(folder).with_context(in_folder)? {
-        let path = entry.with_context(in_folder)?.path();
+    for entry in std::fs::read_dir(folder).map_err(unreadable)? {
+        let path = entry.map_err(unreadable)?.path();
         let is_known =
             |extension: &std::ffi::OsStr| EXTENSIONS.iter().any(|known| extension.eq_ignore_ascii_case(known));
         if path.extension().is_some_and(is_known) {
-            files.push(path);
+            let name = path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned();
+            files.push(ImageFile { name, path });
         }
     }
-    files.sort();
+    files.sort_by(|a, b| a.path.cmp(&b.path));
     if files.is_empty() {
-        return Err(BadArgument(format!("{}: no .jpg, .jpeg or .png image", folder.display())).into());
+        return Err(BadArgument(format!("{}: no .jpg, .jpeg or .png image", folder.display())));
     }
     Ok(files)
 }
 
-/// Detects a target in image files, on all processors; the results are in the order of the files. `is_hidden`: no
-/// progress bar.
-pub(super) fn detect(files: &[PathBuf], target: &TargetSpec, is_hidden: bool) -> Vec<DetectedImage> {
-    let bar = print::bar(Some(files.len() as u64), "{bar:30} {pos} of {len} images", is_hidden);
+/// Detects a target in image files, on all processors; the results are in the order of the files. Images that cannot be
+/// read are named in a warning.
+///
+/// * `is_hidden`: no progress bar.
+///
+/// # Errors
+/// If no image can be read.
+pub(super) fn detect(
+    files: &[ImageFile],
+    target: &TargetSpec,
+    is_hidden: bool,
+) -> Result<Vec<DetectedImage>, BadArgument> {
+    let detected = detect_each(files, is_hidden, |ImageFile { name, path }| DetectedImage {
+        name: name.clone(),
+        board: detect_in_file(path, name, target),
+    });
+    check_readable(&detected)?;
+    Ok(detected)
+}
+
+/// Calls a function for each image, on all processors; the results are in the order of the images.
+///
+/// * `is_hidden`: no progress bar.
+pub(super) fn detect_each<T: Sync>(
+    images: &[T],
+    is_hidden: bool,
+    detect: impl Fn(&T) -> DetectedImage + Sync,
+) -> Vec<DetectedImage> {
+    let bar = print::bar(Some(images.len() as u64), "{bar:30} {pos} of {len} images", is_hidden);
     let next = AtomicUsize::new(0);
     let detect_some = || {
         let mut detected = Vec::new();
         loop {
             let ix = next.fetch_add(1, Ordering::Relaxed);
-            let Some(path) = files.get(ix) else { return detected };
-            let name = path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned();
-            let board = detect_in(path, &name, target).map_err(|error| format!("{error:#}"));
-            detected.push((ix, DetectedImage { name, board }));
+            let Some(image) = images.get(ix) else { return detected };
+            detected.push((ix, detect(image)));
             bar.inc(1);
         }
     };
-    let n_threads = std::thread::available_parallelism().map_or(1, |n| n.get().min(files.len()));
+    let n_threads = std::thread::available_parallelism().map_or(1, |n| n.get().min(images.len()));
     let mut detected: Vec<_> = std::thread::scope(|scope| {
         let threads: Vec<_> = (0..n_threads).map(|_| scope.spawn(detect_some)).collect();
         threads.into_iter().flat_map(|thread| thread.join().expect("detection does not panic")).collect()
@@ -75,16 +118,50 @@ pub(super) fn detect(files: &[PathBuf], target: &TargetSpec, is_hidden: bool) ->
     detected.into_iter().map(|(_, image)| image).collect()
 }
 
-fn detect_in(path: &Path, name: &str, target: &TargetSpec) -> anyhow::Result<Board> {
-    let read = || anyhow::Ok(image::ImageReader::open(path)?.with_guessed_format()?.decode()?.into_luma8());
-    let gray = read().context("cannot read the image")?;
+fn check_readable(images: &[DetectedImage]) -> Result<(), BadArgument> {
+    let unreadable: Vec<(&str, &NoBoard)> = images
+        .iter()
+        .filter_map(|image| Some((image.name.as_str(), image.board.as_ref().err()?)))
+        .filter(|(_, reason)| matches!(reason, NoBoard::Unreadable(_)))
+        .collect();
+    let Some((first, reason)) = unreadable.first() else { return Ok(()) };
+    if unreadable.len() == images.len() {
+        return Err(BadArgument(format!("none of {} images can be read; {first}: {reason}", images.len())));
+    }
+    let names: Vec<&str> = unreadable.iter().map(|(name, _)| *name).collect();
+    log::warn!("{} of {} images cannot be read and are skipped: {}", names.len(), images.len(), names.join(", "));
+    Ok(())
+}
+
+fn detect_in_file(path: &Path, name: &str, target: &TargetSpec) -> Result<Board, NoBoard> {
+    let unreadable = |error: image::ImageError| NoBoard::Unreadable(error.to_string());
+    let reader = image::ImageReader::open(path).and_then(image::ImageReader::with_guessed_format);
+    let gray = reader.map_err(|error| unreadable(error.into()))?.decode().map_err(unreadable)?.into_luma8();
     let size_px = [gray.width(), gray.height()];
-    let detection = target.detect(GrayImage { size_px, pixels: gray.as_raw() })?;
-    Ok(Board { size_px, view: view(name, &detection) })
+    detect_in_gray(GrayImage { size_px, pixels: gray.as_raw() }, name, target)
+}
+
+/// Detects a target in an image. `name` is used in messages.
+pub(super) fn detect_in_gray(image: GrayImage<'_>, name: &str, target: &TargetSpec) -> Result<Board, NoBoard> {
+    Ok(Board { size_px: image.size_px, view: view(name, &target.detect(image)?) })
 }
 
 fn view(name: &str, detection: &Detection) -> BoardView {
     let points = detection.corners.iter();
     let points = points.map(|corner| BoardPoint { point_in_board: corner.point_in_board, pixel: corner.pixel });
     BoardView { name: name.to_owned(), points: points.collect() }
+}
+
+/// The files of images, for a report.
+pub(super) fn photos(files: &[ImageFile]) -> Photos {
+    files.iter().map(|file| (file.name.clone(), Photo::File(file.path.clone()))).collect()
+}
+
+/// The images without the target, for a report.
+pub(super) fn unused(images: &[DetectedImage]) -> Vec<Unused> {
+    let reason = |image: &DetectedImage| {
+        let reason = image.board.as_ref().err()?.to_string();
+        Some(Unused { name: image.name.clone(), reason })
+    };
+    images.iter().filter_map(reason).collect()
 }

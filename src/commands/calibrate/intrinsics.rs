@@ -1,7 +1,9 @@
 //! `fieldrig calibrate intrinsics`: the lens of a camera from images of a target.
 
-use super::images::{self, DetectedImage};
+use super::images;
 use super::lens::LensFile;
+use super::outputs::{self, ReportFlag, RigFlags, RigOutput};
+use super::scan::ScanOptions;
 use super::target_argument;
 use crate::exit::{Exit, InsufficientData};
 use crate::print;
@@ -9,8 +11,9 @@ use calibration::{
     BoardView, ImageGrid, IntrinsicsCalibration, IntrinsicsInput, LensModel, LensTrial, calibrate_intrinsics,
 };
 use serde::Serialize;
+use session::calibration_report::{IntrinsicsReport, Photos, Unused};
 use std::collections::BTreeMap;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use targets::TargetSpec;
 
 const TARGET_HELP: &str =
@@ -19,14 +22,19 @@ const TARGET_HELP: &str =
 /// Flags of `calibrate intrinsics`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// Folder of images (.jpg, .png) of the target, all of one camera and one size
-    #[arg(value_name = "IMAGES")]
-    folder: PathBuf,
+    /// Folder of images (.jpg, .png) of the target, all of one camera and one size; or a recording (.mcap) or rig file
+    /// (.toml) whose camera sees the target
+    #[arg(value_name = "IMAGES|RECORDING|RIG")]
+    input: PathBuf,
     #[arg(long, value_name = "SPEC", value_parser = target_argument, help = TARGET_HELP)]
     target: TargetSpec,
     /// Lens model
     #[arg(long, value_name = "MODEL", value_enum, default_value_t = ModelArg::Auto)]
     model: ModelArg,
+    #[command(flatten)]
+    rig: RigFlags,
+    #[command(flatten)]
+    report: ReportFlag,
     /// Print one JSON object
     #[arg(long)]
     json: bool,
@@ -99,45 +107,123 @@ struct PrintedTrial<'a> {
     kept: bool,
 }
 
+/// What was detected in the images.
+struct Detected {
+    views: Vec<BoardView>,
+    sizes_px: Vec<[u32; 2]>,
+    /// Images without the target.
+    unused: Vec<Unused>,
+    photos: Photos,
+    /// Why there are no images.
+    no_images: Option<String>,
+    warnings: Vec<String>,
+}
+
 /// Detects the target, calibrates, and prints the result.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
-    let detected = images::detect(&images::files(&args.folder)?, &args.target, args.json);
-    let (mut views, mut sizes_px, mut rejected) = (Vec::<BoardView>::new(), Vec::new(), Vec::new());
-    for DetectedImage { name, board } in detected {
-        match board {
-            Ok(board) => {
-                views.push(board.view);
-                sizes_px.push(board.size_px);
-            }
-            Err(reason) => rejected.push(PrintedRejection { image: name, reason }),
-        }
+    let report = args.report.open()?;
+    let mut rig = args.rig.open(&args.input)?;
+    let detected = args.detect(report.is_some(), rig.as_mut())?;
+    if let (Some(rig), Some(size_px)) = (&rig, detected.sizes_px.first()) {
+        rig.expect_size(*size_px)?;
     }
-    if views.is_empty() {
-        // All images usually fail for the same reason.
-        let reason = rejected.first().map_or(String::new(), |first| format!("; {}: {}", first.image, first.reason));
-        let text = format!(
-            "{}: {} was not detected in any of {} images{reason}",
-            args.folder.display(),
-            args.target,
-            rejected.len()
-        );
-        return Err(InsufficientData(text).into());
+    let result = args.calibrate(&detected);
+    if let Some(path) = report {
+        args.write_report(path, &detected, &result)?;
     }
-    let input = IntrinsicsInput { views: &views, sizes_px: &sizes_px, model: args.model.into() };
-    let calibration = calibrate_intrinsics(&input)?;
-    rejected.extend(
-        calibration
-            .rejected
-            .iter()
-            .map(|rejected| PrintedRejection { image: rejected.image.clone(), reason: rejected.reason.to_string() }),
-    );
-    let printed = printed(&calibration, rejected);
+    let calibration = result?;
+    let printed = printed(&calibration, &detected.unused);
     if args.json {
         print::json(&printed)?
     } else {
         describe(&printed)?
     }
+    if let Some(warning) = uncertainty_warning(&calibration) {
+        log::warn!("{warning}");
+    }
+    if let Some(rig) = &mut rig {
+        rig.set_intrinsics(&calibration.intrinsics)?;
+        rig.write()?;
+    }
     Ok(Exit::Done)
+}
+
+impl Args {
+    /// Reads the images and detects the target. `output` gets the calibration that devices report.
+    fn detect(&self, keeps_photos: bool, output: Option<&mut RigOutput>) -> anyhow::Result<Detected> {
+        let options = ScanOptions { keeps_photos, is_hidden: self.json };
+        let (images, photos, no_images, warnings) =
+            match self.rig.read(&self.input, Some(&self.target), options, output)? {
+                Some(mut scan) => (scan.detected(), scan.take_photos(), scan.no_images, scan.warnings),
+                None => {
+                    let files = images::files(&self.input)?;
+                    let images = images::detect(&files, &self.target, self.json)?;
+                    (images, images::photos(&files), None, Vec::new())
+                }
+            };
+        let unused = images::unused(&images);
+        let (mut views, mut sizes_px) = (Vec::new(), Vec::new());
+        for board in images.into_iter().filter_map(|image| image.board.ok()) {
+            views.push(board.view);
+            sizes_px.push(board.size_px);
+        }
+        Ok(Detected { views, sizes_px, unused, photos, no_images, warnings })
+    }
+
+    fn calibrate(&self, detected: &Detected) -> anyhow::Result<IntrinsicsCalibration> {
+        let Detected { views, sizes_px, unused, no_images, .. } = detected;
+        if let Some(reason) = no_images {
+            return Err(InsufficientData(reason.clone()).into());
+        }
+        if views.is_empty() {
+            // All images usually fail for the same reason.
+            let reason = unused.first().map_or(String::new(), |first| format!("; {}: {}", first.name, first.reason));
+            let (input, target, n) = (self.input.display(), &self.target, unused.len());
+            let text = format!("{input}: {target} was not detected in any of {n} images{reason}");
+            return Err(InsufficientData(text).into());
+        }
+        Ok(calibrate_intrinsics(&IntrinsicsInput { views, sizes_px, model: self.model.into() })?)
+    }
+
+    fn write_report(
+        &self,
+        path: &Path,
+        detected: &Detected,
+        result: &anyhow::Result<IntrinsicsCalibration>,
+    ) -> anyhow::Result<()> {
+        let calibration = result.as_ref().ok();
+        let warnings = detected.warnings.iter().cloned().chain(calibration.and_then(uncertainty_warning)).collect();
+        let Some(heading) = outputs::heading(&self.input, result, warnings) else { return Ok(()) };
+        let rig_line =
+            calibration.map(|calibration| format!("intrinsics = {}", LensFile::of(&calibration.intrinsics).to_toml()));
+        const NO_IMAGE_PX: [u32; 2] = [640, 480];
+        let report = IntrinsicsReport {
+            heading: &heading,
+            target: &self.target.to_string(),
+            size_px: detected.sizes_px.first().copied().unwrap_or(NO_IMAGE_PX),
+            views: &detected.views,
+            unused: &detected.unused,
+            calibration,
+            rig_line: rig_line.as_deref(),
+            photos: &detected.photos,
+        };
+        outputs::write_report(path, &report.html())
+    }
+}
+
+/// A warning if the result is not accurate.
+fn uncertainty_warning(calibration: &IntrinsicsCalibration) -> Option<String> {
+    const MAX_SIGMA_FRAC: f64 = 0.01;
+    let worst = largest(&calibration.uncertainty_px.values);
+    (worst > MAX_SIGMA_FRAC * f64::from(calibration.intrinsics.size_px[0])).then(|| {
+        format!(
+            "the projection is uncertain by {worst:.1} px; add images with the target tilted and near the corners of the image"
+        )
+    })
+}
+
+fn largest(values: &[Option<f64>]) -> f64 {
+    values.iter().flatten().fold(0.0f64, |largest, value| largest.max(*value))
 }
 
 impl From<ModelArg> for LensModel {
@@ -152,7 +238,14 @@ impl From<ModelArg> for LensModel {
     }
 }
 
-fn printed(calibration: &IntrinsicsCalibration, rejected: Vec<PrintedRejection>) -> Printed<'_> {
+fn printed<'a>(calibration: &'a IntrinsicsCalibration, unused: &[Unused]) -> Printed<'a> {
+    let unused =
+        unused.iter().map(|unused| PrintedRejection { image: unused.name.clone(), reason: unused.reason.clone() });
+    let rejected = calibration
+        .rejected
+        .iter()
+        .map(|rejected| PrintedRejection { image: rejected.image.clone(), reason: rejected.reason.to_string() });
+    let rejected = unused.chain(rejected).collect();
     const N_PINHOLE_PARAMS: usize = 4;
     let names = calibration.params.iter().map(|param| param.name);
     Printed {
@@ -204,15 +297,8 @@ fn describe(printed: &Printed<'_>) -> anyhow::Result<()> {
         let distortion: Vec<String> = lens.distortion.iter().map(|value| format!("{value:.5}")).collect();
         print::line(format!("distortion       {}", distortion.join(", ")))?;
     }
-    let sigmas = printed.projection_sigma_px.values.iter().flatten();
-    let worst = sigmas.fold(0.0f64, |worst, sigma| worst.max(*sigma));
+    let worst = largest(&printed.projection_sigma_px.values);
     print::line(format!("projection       +- {worst:.2} px (largest standard deviation in the image)"))?;
-    const MAX_SIGMA_FRAC: f64 = 0.01;
-    if worst > MAX_SIGMA_FRAC * f64::from(width) {
-        log::warn!(
-            "the projection is uncertain by {worst:.1} px; add images with the target tilted and near the corners of the image"
-        );
-    }
     for rejection in rejected {
         print::line(format!("not used: {}: {}", rejection.image, rejection.reason))?;
     }

@@ -1,22 +1,22 @@
 //! Intrinsics as JSON.
 
+use super::json_object::JsonObject;
 use crate::exit::BadArgument;
 use kinematics::{Intrinsics, Lens};
-use serde::{Deserialize, Serialize};
+use serde::Serialize;
 
 /// Intrinsics in JSON files, as `calibrate intrinsics` prints them. Pixel centers are at +0.5.
-#[derive(Clone, Debug, Serialize, Deserialize)]
+#[derive(Clone, Debug, Serialize)]
 pub(super) struct LensFile {
     /// `pinhole`, `brown_conrady` (five or eight coefficients) or `kannala_brandt`, as in rig files; by default, pinhole
     /// without distortion coefficients, and `brown_conrady` with them.
-    #[serde(default, alias = "lens", skip_serializing_if = "Option::is_none")]
+    #[serde(skip_serializing_if = "Option::is_none")]
     pub(super) model: Option<String>,
-    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[serde(skip_serializing_if = "Option::is_none")]
     pub(super) size_px: Option<[u32; 2]>,
     pub(super) focal_px: [f64; 2],
     pub(super) principal_px: [f64; 2],
     /// Coefficients in OpenCV's order.
-    #[serde(default)]
     pub(super) distortion: Vec<f64>,
 }
 
@@ -25,6 +25,49 @@ const BROWN_CONRADY: &str = "brown_conrady";
 const KANNALA_BRANDT: &str = "kannala_brandt";
 
 impl LensFile {
+    /// Keys of a file with intrinsics, including those that `calibrate intrinsics --json` prints and that are not needed.
+    pub(super) const KEYS: [&'static str; 16] = [
+        "focal_px",
+        "principal_px",
+        "distortion",
+        "lens",
+        "model",
+        "size_px",
+        "coefficients",
+        "rms_px",
+        "noise_px",
+        "sigma",
+        "rejected",
+        "images",
+        "coverage",
+        "projection_sigma_px",
+        "trials",
+        "next_view",
+    ];
+
+    pub(super) fn read(object: &JsonObject<'_>) -> Result<Self, BadArgument> {
+        let side = |value: f64| {
+            let is_side = value.fract() == 0.0 && (1.0..=f64::from(u32::MAX)).contains(&value);
+            #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a whole number in the range")]
+            is_side.then_some(value as u32).ok_or_else(|| object.invalid("size_px", "must be whole numbers above 0"))
+        };
+        let size_px = match object.array::<2>("size_px")? {
+            Some([width, height]) => Some([side(width)?, side(height)?]),
+            None => None,
+        };
+        let model = match object.text("model")? {
+            Some(model) => Some(model),
+            None => object.text("lens")?,
+        };
+        Ok(Self {
+            model: model.map(str::to_owned),
+            size_px,
+            focal_px: object.required("focal_px", object.array("focal_px")?)?,
+            principal_px: object.required("principal_px", object.array("principal_px")?)?,
+            distortion: object.numbers("distortion")?.unwrap_or_default(),
+        })
+    }
+
     pub(super) fn of(intrinsics: &Intrinsics) -> Self {
         let (model, distortion) = match &intrinsics.lens {
             Lens::Pinhole => (PINHOLE, Vec::new()),

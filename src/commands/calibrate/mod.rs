@@ -3,7 +3,10 @@
 mod hand_eye;
 mod images;
 mod intrinsics;
+mod json_object;
 mod lens;
+mod outputs;
+mod scan;
 mod scene;
 mod target;
 mod time_offset;

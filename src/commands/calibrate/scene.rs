@@ -1,17 +1,21 @@
 //! `fieldrig calibrate scene`: calibrates the cameras of a rig from images of a static scene.
 
+use super::outputs::{self, ReportFlag, is_rig_file};
 use super::{matrix_of, print_matrix};
 use crate::console::ReadBar;
 use crate::exit::{self, BadArgument, Exit, InsufficientData};
 use crate::{print, signals};
-use calibration::{CameraCorrection, Estimate, Trial, rigid_transform};
+use calibration::{CameraCorrection, Estimate, PoseSigmas, Trial, rigid_transform};
 use capture::config::{Override, Rig};
 use capture::open::{self, Devices};
 use drivers::Sample;
 use keyframe::listed;
 use kinematics::Stamp;
 use serde::Serialize;
-use session::{Data, DataOptions, Purpose, Refine, SCENE_PARAMS, SceneCalibration, calibrate_scene, corrected_rig};
+use session::calibration_report::SceneReport;
+use session::{
+    Data, DataOptions, Purpose, Refine, RelativePose, SCENE_PARAMS, SceneCalibration, calibrate_scene, corrected_rig,
+};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
@@ -43,6 +47,8 @@ pub(crate) struct Args {
     /// Write the rig file with the accepted corrections. An existing file is kept with the extension .old
     #[arg(long, value_name = "FILE")]
     write_rig: Option<PathBuf>,
+    #[command(flatten)]
+    report: ReportFlag,
     /// Print one JSON object
     #[arg(long)]
     json: bool,
@@ -73,10 +79,25 @@ struct PrintedCamera {
     /// Why its extrinsics are those of the rig file.
     refused: Option<String>,
     parent_from_camera: [[f64; 4]; 4],
+    /// Standard deviations along and about the axes of the camera; null if its extrinsics were not estimated.
+    sigma_mm: Option<[f64; 3]>,
+    sigma_deg: Option<[f64; 3]>,
+    /// Pose in the frame of the first camera with the same parent; null for that camera.
+    relative: Option<PrintedRelative>,
     focal_px: [f64; 2],
     principal_px: [f64; 2],
     /// Time from the stamps of the images to mid-exposure, milliseconds.
     stamp_to_mid_exposure_millis: Option<f64>,
+}
+
+/// Pose of a camera in the frame of another one.
+#[derive(Debug, Serialize)]
+struct PrintedRelative {
+    camera: String,
+    camera_from_this: [[f64; 4]; 4],
+    /// Standard deviations along and about the axes of this camera; null if they are unknown.
+    sigma_mm: Option<[f64; 3]>,
+    sigma_deg: Option<[f64; 3]>,
 }
 
 /// Calibrates and prints the estimates. Exit code 4 if the data do not determine the extrinsics of any camera.
@@ -84,6 +105,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     if args.params.len() > 1 && args.params.contains(&Refine::Auto) {
         return Err(BadArgument("--params: auto cannot be combined with other values".into()).into());
     }
+    let report = args.report.open()?;
     let given = args.rig_as_given()?;
     if let Some(file) = &args.write_rig {
         let Some(rig) = &given else {
@@ -95,13 +117,13 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let data = args.data()?;
     // Devices may report calibration that the rig file does not contain.
     let rig = if args.sim || data.rig.is_none() || !is_rig_file(&args.input) { given } else { data.rig.clone() };
-    let calibration = calibrate_scene(&data, &args.params, rig.as_ref())?;
-    let exit = exit::from_losses(&data.data_losses);
-    let mut printed = printed(&data, &calibration, calibration.is_refused(&data));
-    let alignment = &calibration.alignment;
-    if alignment.estimates.is_empty() && !alignment.has_enough_validation_images() {
-        printed.refused = Some("too few validation images to accept a correction; record more images".to_owned());
+    let result = calibrate_scene(&data, &args.params, rig.as_ref()).map_err(anyhow::Error::from);
+    if let Some(path) = report {
+        args.write_report(path, &data, rig.as_ref(), &result)?;
     }
+    let calibration = result?;
+    let exit = exit::from_losses(&data.data_losses);
+    let printed = printed(&data, &calibration, refusal(&data, &calibration));
     let is_refused = printed.refused.is_some();
     if args.json {
         print::json(&printed)?;
@@ -126,6 +148,16 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     Ok(exit)
 }
 
+/// Why no camera could be calibrated; `None` if one could.
+fn refusal(data: &Data, calibration: &SceneCalibration) -> Option<String> {
+    let alignment = &calibration.alignment;
+    if alignment.estimates.is_empty() && !alignment.has_enough_validation_images() {
+        return Some("too few validation images to accept a correction; record more images".to_owned());
+    }
+    let reasons = calibration.refused.iter().map(|(camera, reason)| format!("camera {camera:?}: {reason}"));
+    calibration.is_refused(data).then(|| reasons.collect::<Vec<_>>().join("; "))
+}
+
 fn scene_param(text: &str) -> Result<Refine, String> {
     SCENE_PARAMS.into_iter().find(|param| param.name() == text).ok_or_else(|| {
         let names = SCENE_PARAMS.map(Refine::name);
@@ -138,9 +170,37 @@ impl Args {
         DataOptions { keyframes: self.keyframes.clone(), rig: self.rig.clone(), ..DataOptions::default() }
     }
 
+    fn write_report(
+        &self,
+        path: &Path,
+        data: &Data,
+        rig: Option<&Rig>,
+        result: &anyhow::Result<SceneCalibration>,
+    ) -> anyhow::Result<()> {
+        let calibration = result.as_ref().ok();
+        let Some(mut heading) = outputs::heading(&self.input, result, data.data_losses.clone()) else { return Ok(()) };
+        if let Some(calibration) = calibration {
+            heading.refused = refusal(data, calibration);
+            let kept = calibration
+                .refused
+                .iter()
+                .map(|(camera, reason)| format!("camera {camera:?} keeps its extrinsics: {reason}"));
+            heading.warnings.extend(kept.filter(|_| heading.refused.is_none()));
+        }
+        let mut n_images: BTreeMap<String, usize> = BTreeMap::new();
+        for keyframe in &data.keyframes {
+            *n_images.entry(keyframe.camera.to_string()).or_default() += 1;
+        }
+        let n_images: Vec<(String, usize)> = n_images.into_iter().collect();
+        let report = SceneReport { heading: &heading, rig, n_images: &n_images, calibration };
+        outputs::write_report(path, &report.html())
+    }
+
     /// The rig file, without settings that apply only to this command; `None` for a folder.
     fn rig_as_given(&self) -> anyhow::Result<Option<Rig>> {
-        session::expect(&self.input)?;
+        if !self.input.exists() {
+            return Err(BadArgument(format!("{} does not exist", self.input.display())).into());
+        }
         if is_rig_file(&self.input) {
             return Ok(Some(Rig::load(&self.input, &[])?));
         }
@@ -173,16 +233,16 @@ impl Args {
     }
 }
 
-fn is_rig_file(path: &Path) -> bool {
-    path.extension().is_some_and(|extension| extension == "toml")
-}
-
-fn printed<'a>(data: &Data, calibration: &'a SceneCalibration, is_refused: bool) -> Printed<'a> {
+fn printed<'a>(data: &Data, calibration: &'a SceneCalibration, refused: Option<String>) -> Printed<'a> {
     let cameras = calibration.rig.iter().flat_map(|rig| &rig.cameras).map(|camera| {
+        let sigmas = calibration.sigmas(&camera.name);
         let printed = PrintedCamera {
             n_images: data.keyframes.iter().filter(|keyframe| *keyframe.camera == *camera.name).count(),
             refused: calibration.refused.get(&*camera.name).cloned(),
             parent_from_camera: matrix_of(&camera.parent_from_camera),
+            sigma_mm: sigmas.map(sigma_mm),
+            sigma_deg: sigmas.map(sigma_deg),
+            relative: calibration.relative(&camera.name).map(relative),
             focal_px: camera.intrinsics.focal_px,
             principal_px: camera.intrinsics.principal_px,
             stamp_to_mid_exposure_millis: camera.stamp_to_mid_exposure.as_ref().map(|offset| offset.value_millis),
@@ -190,7 +250,6 @@ fn printed<'a>(data: &Data, calibration: &'a SceneCalibration, is_refused: bool)
         (&*camera.name, printed)
     });
     let alignment = &calibration.alignment;
-    let reasons = calibration.refused.iter().map(|(camera, reason)| format!("camera {camera:?}: {reason}"));
     Printed {
         n_images: data.keyframes.len(),
         cameras: cameras.collect(),
@@ -201,8 +260,26 @@ fn printed<'a>(data: &Data, calibration: &'a SceneCalibration, is_refused: bool)
         estimates: &alignment.estimates,
         trials: &alignment.trials,
         unobservable: alignment.unobservable.iter().map(ToString::to_string).collect(),
-        refused: is_refused.then(|| reasons.collect::<Vec<_>>().join("; ")),
+        refused,
     }
+}
+
+fn relative(relative: RelativePose) -> PrintedRelative {
+    let RelativePose { first, first_from_camera, sigmas } = relative;
+    PrintedRelative {
+        camera: first,
+        camera_from_this: matrix_of(&first_from_camera),
+        sigma_mm: sigmas.map(sigma_mm),
+        sigma_deg: sigmas.map(sigma_deg),
+    }
+}
+
+fn sigma_mm(sigmas: PoseSigmas) -> [f64; 3] {
+    sigmas.m.map(|m| 1e3 * m)
+}
+
+fn sigma_deg(sigmas: PoseSigmas) -> [f64; 3] {
+    sigmas.rad.map(f64::to_degrees)
 }
 
 fn given_from_corrected<'a>((camera, correction): (&'a String, &CameraCorrection)) -> (&'a str, [[f64; 4]; 4]) {
@@ -234,6 +311,23 @@ fn describe(printed: &Printed<'_>, calibration: &SceneCalibration, is_auto: bool
         }
         print::line(format!("parent_from_camera of {name}, row by row ({} images):", camera.n_images))?;
         print_matrix(&camera.parent_from_camera)?;
+        print_sigmas(camera.sigma_mm, camera.sigma_deg)?;
+        if let Some(relative) = &camera.relative {
+            print::line(format!("pose of {name} in the frame of {}, row by row:", relative.camera))?;
+            print_matrix(&relative.camera_from_this)?;
+            print_sigmas(relative.sigma_mm, relative.sigma_deg)?;
+        }
     }
+    Ok(())
+}
+
+fn print_sigmas(mm: Option<[f64; 3]>, deg: Option<[f64; 3]>) -> anyhow::Result<()> {
+    let (Some(mm), Some(deg)) = (mm, deg) else { return Ok(()) };
+    let list = |values: [f64; 3]| values.map(|value| format!("{value:.3}")).join(", ");
+    print::line(format!(
+        "standard deviations along and about the camera's x, y and z axes: {} mm; {} degrees",
+        list(mm),
+        list(deg)
+    ))?;
     Ok(())
 }

@@ -1,14 +1,17 @@
 //! `fieldrig calibrate time-offset`: the offset between the clocks of two pose streams.
 
+use super::outputs::{self, ReportFlag};
 use super::{matrix_of, print_matrix};
-use crate::exit::{BadArgument, Exit, InsufficientData};
+use crate::exit::{self, BadArgument, Exit, InsufficientData};
 use crate::print;
-use anyhow::Context;
 use calibration::hand_eye::Refusal;
-use calibration::time_offset::{PoseSample, TimeOffset, TimeOffsetOptions, estimate_time_offset};
+use calibration::time_offset::{
+    MotionProfile, PoseSample, TimeOffset, TimeOffsetOptions, estimate_time_offset, motion_profile,
+};
 use kinematics::Transform;
 use nalgebra::{Quaternion, Translation3, UnitQuaternion};
 use serde::Serialize;
+use session::calibration_report::TimeOffsetReport;
 use std::path::{Path, PathBuf};
 
 /// Flags of `calibrate time-offset`.
@@ -27,6 +30,8 @@ pub(crate) struct Args {
     /// Largest absolute offset to search, seconds [default: all offsets at which the streams overlap]
     #[arg(long, value_name = "S", value_parser = super::super::number_in_range(0.001..=1e9))]
     max_offset: Option<f64>,
+    #[command(flatten)]
+    report: ReportFlag,
     /// Print one JSON object
     #[arg(long)]
     json: bool,
@@ -58,15 +63,20 @@ struct Printed {
 
 /// Estimates and prints the offset. Exit code 4 if the motion does not determine it, or a requested transform.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
+    let report = args.report.open()?;
     let (a, b) = (read(&args.a)?, read(&args.b)?);
     let options =
         TimeOffsetOptions { hand_eye: args.hand_eye, max_offset_secs: args.max_offset, ..TimeOffsetOptions::default() };
-    let printed = match estimate_time_offset(&a, &b, &options) {
+    let result = estimate_time_offset(&a, &b, &options).map_err(anyhow::Error::from);
+    if let Some(path) = report {
+        args.write_report(path, motion_profile(&a, &b, &options).ok().as_ref(), &result)?;
+    }
+    let printed = match result {
         Ok(offset) => Printed::of(&offset),
-        Err(calibration::Error::Refused(refusal)) => {
-            Printed { refused: Some(refusal.to_string()), ..Printed::default() }
+        Err(error) if exit::of(&error) == Exit::InsufficientData => {
+            Printed { refused: Some(error.to_string()), ..Printed::default() }
         }
-        Err(error) => return Err(error.into()),
+        Err(error) => return Err(error),
     };
     let refused = printed.refused.as_ref().or(printed.hand_eye_refused.as_ref()).cloned();
     if args.json {
@@ -78,6 +88,24 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         None => Ok(Exit::Done),
         Some(_) if args.json => Ok(Exit::InsufficientData),
         Some(reason) => Err(InsufficientData(reason).into()),
+    }
+}
+
+impl Args {
+    fn write_report(
+        &self,
+        path: &Path,
+        profile: Option<&MotionProfile>,
+        result: &anyhow::Result<TimeOffset>,
+    ) -> anyhow::Result<()> {
+        let offset = result.as_ref().ok();
+        let refusal = offset.and_then(|offset| offset.hand_eye.as_ref()?.as_ref().err());
+        let warning = refusal.map(|refusal| format!("the transform between the bodies is refused: {refusal}"));
+        let input = format!("{} and {}", self.a.display(), self.b.display());
+        let Some(heading) = outputs::heading(Path::new(&input), result, warning.into_iter().collect()) else {
+            return Ok(());
+        };
+        outputs::write_report(path, &TimeOffsetReport { heading: &heading, profile, offset }.html())
     }
 }
 
@@ -102,7 +130,7 @@ impl Printed {
 
 /// Reads the rows of a file. Comments and a header are skipped; a row of numbers that is not a pose is an error.
 fn read(path: &Path) -> anyhow::Result<Vec<PoseSample>> {
-    let text = std::fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))?;
+    let text = outputs::read_text(path)?;
     let mut samples = Vec::new();
     for (ix, line) in text.lines().enumerate() {
         let parsed = line.split([',', ' ', ';', '\t']).filter(|field| !field.is_empty()).map(str::parse::<f64>);

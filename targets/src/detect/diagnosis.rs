@@ -3,15 +3,75 @@
 use crate::dictionary::Dictionary;
 use crate::error::{Ids, NotDetected};
 use crate::gray::Plane;
-use crate::layout::layouts;
+use crate::homography::Homography;
+use crate::lattice::distance;
+use crate::layout::{self, Layout, layouts};
 use crate::marker::{Exact, Marker, read_exactly};
 use crate::quad::Quad;
-use crate::spec::{Pattern, TargetSpec};
+use crate::spec::{Millimeters, Pattern, TargetSpec};
 
 /// Fewer different markers without an error may be chance.
 const MIN_MARKERS: usize = 3;
 /// Cells per side from which a single marker without an error is no chance.
 const MIN_BITS_OF_SINGLE: usize = 6;
+
+/// Difference of the size of markers that may prevent the detection of corners.
+pub(super) const MIN_SIZE_CHANGE: f64 = 0.1;
+
+/// The size of ChArUco markers relative to the squares, if it is not that of the target.
+///
+/// Each marker measures the distance to its neighbors in units of its side.
+///
+/// * `min_change`: smaller relative differences are ignored. Blur makes small markers look up to 10 % smaller.
+pub(super) fn marker_size(target: &TargetSpec, markers: &[Marker], min_change: f64) -> Option<NotDetected> {
+    const MIN_PAIRS: usize = 4;
+    /// Pairs that measure the same size, if the markers are in the right places.
+    const MIN_SAME_FRAC: f64 = 0.8;
+    const SAME: f64 = 0.1;
+    let Pattern::Charuco { square_m, marker_m, .. } = target.pattern else { return None };
+    let expected_frac = marker_m / square_m;
+    let measured = |layout: &Layout| -> Option<f64> {
+        let fracs = neighbor_fracs(layout, markers, square_m, marker_m);
+        let mut sorted = fracs.clone();
+        sorted.sort_by(f64::total_cmp);
+        let median = *sorted.get(sorted.len() / 2)?;
+        let n_same = fracs.iter().filter(|frac| (*frac / median - 1.0).abs() < SAME).count();
+        let is_consistent = fracs.len() >= MIN_PAIRS && n_same as f64 >= MIN_SAME_FRAC * fracs.len() as f64;
+        is_consistent.then_some(median)
+    };
+    let found_frac = layouts(&target.pattern).iter().find_map(measured)?;
+    let is_possible = found_frac > 0.0 && found_frac < 1.0;
+    (is_possible && (found_frac / expected_frac - 1.0).abs() > min_change).then(|| NotDetected::MarkerSize {
+        found_frac,
+        expected_frac,
+        square: Millimeters(square_m).to_string(),
+        marker: format!("{:.0}mm", 1e3 * found_frac * square_m),
+    })
+}
+
+/// The size of a marker relative to a square according to each marker and its neighbors.
+fn neighbor_fracs(layout: &Layout, markers: &[Marker], square_m: f64, marker_m: f64) -> Vec<f64> {
+    const MAX_SQUARES: f64 = 1.6; // Diagonal neighbors.
+    let mut fracs = Vec::new();
+    for from in markers {
+        let Some(corners_m) = layout.corners_m.get(from.id as usize) else { continue };
+        let (center_m, center_px) = (layout::center(corners_m), layout::center(&from.corners_px));
+        let relative = |quad: &Quad, [x, y]: [f64; 2]| quad.map(|corner| [corner[0] - x, corner[1] - y]);
+        let (on_board, in_image) = (relative(corners_m, center_m), relative(&from.corners_px, center_px));
+        let Some(board_from_pixel) = Homography::from_corners(&in_image, &on_board) else { continue };
+        for to in markers.iter().filter(|to| to.id != from.id) {
+            let Some(to_m) = layout.corners_m.get(to.id as usize) else { continue };
+            let squares = distance(layout::center(to_m), center_m) / square_m;
+            let [x, y] = layout::center(&to.corners_px);
+            let [across, along] = board_from_pixel.map([x - center_px[0], y - center_px[1]]);
+            let sides = across.hypot(along) / marker_m;
+            if squares < MAX_SQUARES && sides > 0.0 && sides.is_finite() {
+                fracs.push(squares / sides);
+            }
+        }
+    }
+    fracs
+}
 
 /// Explains why the markers found in an image are not those of the target.
 pub(super) fn markers(
@@ -37,7 +97,7 @@ pub(super) fn markers(
         return if 2 * n_expected < found.0.len() {
             NotDetected::OtherIds { found, expected: Ids(expected.collect()) }
         } else {
-            NotDetected::OtherArrangement { found }
+            marker_size(target, markers, MIN_SIZE_CHANGE).unwrap_or(NotDetected::OtherArrangement { found })
         };
     }
     // Number of markers, without those that may be chance.

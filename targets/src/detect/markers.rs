@@ -14,6 +14,8 @@ use crate::template::{self, Neighborhood};
 
 /// Widths of the black border of tags, in cells: Kalibr prints 2, AprilTag 1.
 const TAG_BORDERS: [usize; 2] = [1, 2];
+/// Largest difference of the size of ChArUco markers from that of the target, relative to it.
+const MAX_SIZE_CHANGE: f64 = 0.2;
 /// Largest distance of a corner from the intersection of the tag's sides, relative to the side: lenses bend them.
 const MAX_MOVE_FRAC: f64 = 0.04;
 
@@ -37,9 +39,14 @@ pub(super) fn detect(target: &TargetSpec, plane: &Plane) -> Result<Detection, No
         _ => Vec::new(),
     };
     if pixels.len() < MIN_CORNERS {
-        return Err(NotDetected::TooFewCorners { found: pixels.len(), min: MIN_CORNERS });
+        let too_few = NotDetected::TooFewCorners { found: pixels.len(), min: MIN_CORNERS };
+        return Err(diagnosis::marker_size(target, &markers, diagnosis::MIN_SIZE_CHANGE).unwrap_or(too_few));
     }
-    Ok(target.detection(pixels, fit.layout.is_legacy))
+    // The corners do not depend on the markers, but if their size is wrong, that of the squares may be wrong, too.
+    match diagnosis::marker_size(target, &fit.markers, MAX_SIZE_CHANGE) {
+        Some(other) => Err(other),
+        None => Ok(target.detection(pixels, fit.layout.is_legacy)),
+    }
 }
 
 /// Corners of the largest tag with an id.

@@ -1,0 +1,173 @@
+//! How often the stated uncertainty contains the truth.
+
+use super::method::squared_error;
+use super::scene::{self, Noise, Scene, brown_conrady, camera_from_board, intrinsics, view};
+use calibration::hand_eye::{HandEyeOptions, calibrate_hand_eye};
+use calibration::{BoardView, IntrinsicsInput, LensModel, calibrate_intrinsics};
+use kinematics::Lens;
+use kinematics::quantile::median;
+use kinematics::random::Random;
+use nalgebra::DVector;
+use rayon::prelude::{IntoParallelIterator, ParallelIterator};
+use serde::Serialize;
+
+/// Images or poses per calibration.
+const N_POSES: usize = 15;
+/// Standard deviation of the rotation of the camera, radians.
+const SPREAD_RAD: f64 = 0.4;
+const CORNER_PX: f64 = 0.1;
+
+/// Results of one kind of calibration.
+#[derive(Clone, Debug, Serialize)]
+pub(super) struct Coverage {
+    pub(super) name: &'static str,
+    pub(super) n_runs: usize,
+    /// Runs without a result.
+    pub(super) n_refused: usize,
+    /// Fraction of the results whose 95 % ellipsoid contains the truth.
+    pub(super) covered_frac: f64,
+    /// Median and 95th percentile of the error: position (mm) and rotation (degrees) of the camera; for intrinsics,
+    /// focal length and principal point (px).
+    pub(super) median: [f64; 2],
+    pub(super) p95: [f64; 2],
+    pub(super) units: [&'static str; 2],
+    /// Smallest confidence level of the ellipsoid that contains the truth, for each result, in ascending order.
+    #[serde(skip)]
+    pub(super) levels: Vec<f64>,
+}
+
+/// Confidence level of the ellipsoid through the truth, and two errors.
+type Run = (f64, [f64; 2]);
+
+impl Coverage {
+    fn of(name: &'static str, units: [&'static str; 2], runs: Vec<Option<Run>>) -> Self {
+        let found: Vec<Run> = runs.iter().copied().flatten().collect();
+        let column = |ix: usize| found.iter().map(|(_, errors)| errors[ix]).collect::<Vec<f64>>();
+        let mut levels: Vec<f64> = found.iter().map(|(level, _)| *level).collect();
+        levels.sort_by(f64::total_cmp);
+        let n_covered = levels.iter().filter(|level| **level < 0.95).count();
+        Self {
+            name,
+            n_runs: runs.len(),
+            n_refused: runs.len() - found.len(),
+            covered_frac: n_covered as f64 / found.len().max(1) as f64,
+            median: [0, 1].map(|ix| median(&column(ix)).unwrap_or(f64::NAN)),
+            p95: [0, 1].map(|ix| p95(column(ix))),
+            units,
+            levels,
+        }
+    }
+}
+
+fn p95(mut values: Vec<f64>) -> f64 {
+    kinematics::quantile::quantile(&mut values, 0.95, kinematics::quantile::Rank::Upper).unwrap_or(f64::NAN)
+}
+
+/// Measures all kinds with `n_runs` seeds each.
+pub(super) fn measure(n_runs: u64) -> Vec<Coverage> {
+    let exact = Noise { corner_px: CORNER_PX, robot_rad: 0.0, robot_m: 0.0 };
+    let inexact = Noise { robot_rad: 3e-4, robot_m: 3e-4, ..exact };
+    let hand_eye = |name, noise: Noise, has_poses: bool, options: HandEyeOptions| {
+        let runs = (0..n_runs).into_par_iter().map(|seed| hand_eye_run(seed, noise, has_poses, options));
+        Coverage::of(name, ["mm", "degrees"], runs.collect())
+    };
+    let lens = |name, lens: Lens, model: LensModel| {
+        let runs = (0..n_runs).into_par_iter().map(|seed| intrinsics_run(seed, lens, model));
+        Coverage::of(name, ["px", "px"], runs.collect())
+    };
+    let default = HandEyeOptions::default();
+    let with_lens = HandEyeOptions { estimate_intrinsics: true, ..default };
+    vec![
+        hand_eye("hand-eye, exact robot", exact, false, default),
+        hand_eye("hand-eye, robot with 0.3 mm and 0.3 mrad", inexact, false, default),
+        hand_eye("hand-eye with lens, exact robot", exact, false, with_lens),
+        hand_eye("hand-eye from board poses, robot with 0.3 mm and 0.3 mrad", inexact, true, default),
+        lens("lens, pinhole", Lens::Pinhole, LensModel::Pinhole),
+        lens("lens, Brown-Conrady", brown_conrady(), LensModel::BrownConrady5),
+        lens("lens, Kannala-Brandt", Lens::KannalaBrandt([0.03, -0.01, 0.002, 0.0]), LensModel::KannalaBrandt),
+    ]
+}
+
+fn hand_eye_run(seed: u64, noise: Noise, has_poses: bool, options: HandEyeOptions) -> Option<Run> {
+    const N_PARAMS: usize = 6;
+    let scene = Scene::new(N_POSES, SPREAD_RAD, 1000 + seed);
+    let samples = scene.samples(noise, seed);
+    let samples = if has_poses { scene::with_board_poses(&samples) } else { samples };
+    let found = calibrate_hand_eye(&scene::input(samples, options)).ok()?;
+    let error = scene.flange_from_camera.inverse() * found.parent_from_camera;
+    let errors = [1e3 * error.translation.vector.norm(), error.rotation.angle().to_degrees()];
+    Some((chi_squared_cdf(squared_error(&found, &scene.flange_from_camera), N_PARAMS), errors))
+}
+
+fn intrinsics_run(seed: u64, lens: Lens, model: LensModel) -> Option<Run> {
+    let mut random = Random::new(2000 + seed);
+    let truth = intrinsics(lens);
+    let views: Vec<BoardView> = (0..N_POSES)
+        .map(|ix| {
+            let pose = camera_from_board(&truth, SPREAD_RAD, &mut random);
+            BoardView { name: format!("{ix}"), ..view(&truth, &pose, CORNER_PX, &mut random) }
+        })
+        .collect();
+    let sizes_px = vec![truth.size_px; N_POSES];
+    let found = calibrate_intrinsics(&IntrinsicsInput { views: &views, sizes_px: &sizes_px, model }).ok()?;
+    let difference = |axes: [f64; 2], truth: [f64; 2]| (axes[0] - truth[0]).hypot(axes[1] - truth[1]);
+    let errors = [
+        difference(found.intrinsics.focal_px, truth.focal_px),
+        difference(found.intrinsics.principal_px, truth.principal_px),
+    ];
+    let true_params = truth.params();
+    let error = DVector::from_iterator(
+        found.params.len(),
+        found.params.iter().zip(&true_params).map(|(param, truth)| param.value - truth),
+    );
+    let squared = found.covariance.clone().cholesky().map_or(f64::INFINITY, |factor| error.dot(&factor.solve(&error)));
+    Some((chi_squared_cdf(squared, found.params.len()), errors))
+}
+
+/// Probability that a chi-squared variable is at most `x`, by the series of the incomplete gamma function.
+pub(super) fn chi_squared_cdf(x: f64, degrees_of_freedom: usize) -> f64 {
+    /// Larger values have a probability of 1 in f64.
+    const MAX: f64 = 300.0;
+    let is_small = x < MAX; // False for NaN.
+    if !is_small {
+        return 1.0;
+    }
+    let (a, half) = (0.5 * degrees_of_freedom as f64, 0.5 * x.max(0.0));
+    // Gamma(a + 1) from Gamma(1) or Gamma(1/2).
+    let (mut gamma, mut at) =
+        if degrees_of_freedom.is_multiple_of(2) { (1.0, 1.0) } else { (std::f64::consts::PI.sqrt(), 0.5) };
+    while at < a + 0.5 {
+        gamma *= at;
+        at += 1.0;
+    }
+    let (mut term, mut sum, mut n) = (1.0, 1.0, a);
+    while term > 1e-16 * sum {
+        n += 1.0;
+        term *= half / n;
+        sum += term;
+    }
+    (half.powf(a) * (-half).exp() / gamma * sum).clamp(0.0, 1.0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn chi_squared_quantiles_match_tables() {
+        for (quantile, degrees_of_freedom, probability) in
+            [(12.592, 6, 0.95), (16.919, 9, 0.95), (9.488, 4, 0.95), (5.348, 6, 0.5), (3.841, 1, 0.95)]
+        {
+            let found = chi_squared_cdf(quantile, degrees_of_freedom);
+            assert!((found - probability).abs() < 1e-4, "{degrees_of_freedom}: {found}");
+        }
+        assert_eq!((chi_squared_cdf(f64::NAN, 6), chi_squared_cdf(0.0, 6)), (1.0, 0.0));
+    }
+
+    #[test]
+    fn stated_uncertainty_covers_the_truth() {
+        for coverage in measure(12) {
+            assert!(coverage.covered_frac > 0.7 && coverage.n_refused == 0, "{coverage:?}");
+        }
+    }
+}

@@ -1,0 +1,119 @@
+//! The compared methods of hand-eye calibration and the outcome of one calibration.
+
+use super::scene::{input, with_board_poses};
+use calibration::hand_eye::{
+    BoardObservation, ClosedForm, HandEyeCalibration, HandEyeOptions, HandEyeSample, calibrate_hand_eye,
+};
+use kinematics::Transform;
+use nalgebra::Vector6;
+use serde::Serialize;
+
+/// A method of hand-eye calibration.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Method {
+    /// A closed form of the board poses.
+    ClosedForm(ClosedForm),
+    /// [`calibrate_hand_eye`] with board poses.
+    Refined,
+    /// [`calibrate_hand_eye`] with corners.
+    Joint,
+    /// [`calibrate_hand_eye`] with corners and unknown intrinsics.
+    JointWithLens,
+}
+
+impl Method {
+    pub(super) const ALL: [Self; 6] = [
+        Self::ClosedForm(ClosedForm::ParkMartin),
+        Self::ClosedForm(ClosedForm::Daniilidis),
+        Self::ClosedForm(ClosedForm::TsaiLenz),
+        Self::Refined,
+        Self::Joint,
+        Self::JointWithLens,
+    ];
+
+    pub(super) fn name(self) -> &'static str {
+        match self {
+            Self::ClosedForm(ClosedForm::ParkMartin) => "Park-Martin",
+            Self::ClosedForm(ClosedForm::Daniilidis) => "Daniilidis",
+            Self::ClosedForm(ClosedForm::TsaiLenz) => "Tsai-Lenz",
+            Self::Refined => "refined (board poses)",
+            Self::Joint => "joint (corners)",
+            Self::JointWithLens => "joint with lens",
+        }
+    }
+
+    /// Calibrates from corners.
+    pub(super) fn calibrate(self, samples: &[HandEyeSample], truth: &Transform) -> Outcome {
+        let options = HandEyeOptions { estimate_intrinsics: self == Self::JointWithLens, ..HandEyeOptions::default() };
+        let found = match self {
+            Self::ClosedForm(solver) => {
+                let pairs: Vec<_> = with_board_poses(samples).iter().filter_map(pair).collect();
+                let found = solver.flange_from_camera(&pairs);
+                return found.map_or(Outcome::Refused, |found| Outcome::Solved(Errors::of(&found, truth, None)));
+            }
+            Self::Refined => calibrate_hand_eye(&input(with_board_poses(samples), options)),
+            Self::Joint | Self::JointWithLens => calibrate_hand_eye(&input(samples.to_vec(), options)),
+        };
+        match found {
+            Ok(found) => {
+                let squared = squared_error(&found, truth);
+                Outcome::Solved(Errors::of(&found.parent_from_camera, truth, Some(squared)))
+            }
+            Err(_) => Outcome::Refused,
+        }
+    }
+}
+
+fn pair(sample: &HandEyeSample) -> Option<(Transform, Transform)> {
+    match &sample.board {
+        BoardObservation::Pose(pose) => Some((sample.base_from_flange, *pose)),
+        BoardObservation::View(_) => None,
+    }
+}
+
+/// Squared Mahalanobis distance of the error; below 12.59 in 95 % of correct calibrations.
+pub(super) fn squared_error(found: &HandEyeCalibration, truth: &Transform) -> f64 {
+    let error = found.parent_from_camera.inverse() * truth;
+    let (t, r) = (error.translation.vector, error.rotation.scaled_axis());
+    let error = Vector6::new(t.x, t.y, t.z, r.x, r.y, r.z);
+    found.covariance.cholesky().map_or(f64::INFINITY, |factor| error.dot(&factor.solve(&error)))
+}
+
+/// Result of one calibration.
+#[derive(Clone, Copy, Debug)]
+pub(super) enum Outcome {
+    Solved(Errors),
+    Refused,
+}
+
+/// Errors of a solved calibration.
+#[derive(Clone, Copy, Debug, Serialize)]
+pub(super) struct Errors {
+    pub(super) mm: f64,
+    pub(super) deg: f64,
+    /// Squared Mahalanobis distance, if the method states an uncertainty.
+    pub(super) squared: Option<f64>,
+}
+
+impl Errors {
+    pub(super) fn of(found: &Transform, truth: &Transform, squared: Option<f64>) -> Self {
+        let error = truth.inverse() * found;
+        Self { mm: 1e3 * error.translation.vector.norm(), deg: error.rotation.angle().to_degrees(), squared }
+    }
+
+    /// Whether the result is unusable: wrong by more than 5 mm or 0.5 degrees, or not finite.
+    pub(super) fn is_broken(&self) -> bool {
+        const MAX_MM: f64 = 5.0;
+        const MAX_DEG: f64 = 0.5;
+        !(self.mm <= MAX_MM && self.deg <= MAX_DEG)
+    }
+}
+
+impl Outcome {
+    pub(super) fn errors(&self) -> Option<Errors> {
+        match self {
+            Self::Solved(errors) => Some(*errors),
+            Self::Refused => None,
+        }
+    }
+}

@@ -1,0 +1,65 @@
+//! Whether the corners contradict the given intrinsics.
+
+use super::geometry::{N_PARAMS, Solution};
+use super::selection::{Free, Selection, corner_fit};
+use kinematics::Intrinsics;
+use nalgebra::{DMatrix, DVector};
+
+/// The corners contradict the given intrinsics.
+pub(super) struct IntrinsicsDoubt {
+    free: Solution,
+    free_covariance: DMatrix<f64>,
+    pub(super) warning: String,
+}
+
+impl IntrinsicsDoubt {
+    /// `None` if free intrinsics do not fit significantly better.
+    pub(super) fn new(selection: Selection<'_>, intrinsics: &Intrinsics) -> Option<Self> {
+        let fit = |is_free: bool| {
+            let free = Free { intrinsics: is_free, joints: false };
+            corner_fit(selection, intrinsics, &[], free).ok()
+        };
+        let (fixed, free) = (fit(false)?, fit(true)?);
+        // Twice the decrease of the cost has as many degrees of freedom as there are intrinsics. Residuals of real
+        // images are not independent, so their variance scales it, and the limit is generous.
+        let n_params = intrinsics.params().len() as f64;
+        let decrease = 2.0 * (fixed.cost - free.cost) / free.variance.max(1.0);
+        (decrease > n_params + 6.0 * (2.0 * n_params).sqrt()).then_some(())?;
+        let change = fixed.state.solution.x.inverse() * free.state.solution.x;
+        let warning = format!(
+            "the corners contradict the given intrinsics: with free intrinsics, {}, and the camera moves by {:.1} mm and {:.2} degrees, which is included in the uncertainty; calibrate the intrinsics, or estimate them here",
+            change_of_intrinsics(intrinsics, &free.state.intrinsics),
+            1e3 * change.translation.vector.norm(),
+            change.rotation.angle().to_degrees()
+        );
+        let free_covariance = free.covariance.view((0, 0), (N_PARAMS, N_PARAMS)).into_owned();
+        Some(Self { free: free.state.solution, free_covariance, warning })
+    }
+
+    /// Covariance to add to that of a solution with the given intrinsics: that of free intrinsics, and the square of the
+    /// difference.
+    pub(super) fn covariance(&self, solution: &Solution) -> DMatrix<f64> {
+        let mut shift = DVector::zeros(N_PARAMS);
+        for (first, from, to) in [(0, solution.x, self.free.x), (6, solution.y, self.free.y)] {
+            let change = from.inverse() * to;
+            shift.fixed_rows_mut::<3>(first).copy_from(&change.rotation.scaled_axis());
+            shift.fixed_rows_mut::<3>(first + 3).copy_from(&change.translation.vector);
+        }
+        &self.free_covariance + &shift * shift.transpose()
+    }
+}
+
+/// The changes of focal length and principal point, the larger one first.
+fn change_of_intrinsics(given: &Intrinsics, free: &Intrinsics) -> String {
+    let largest = |a: [f64; 2], b: [f64; 2]| f64::max((a[0] - b[0]).abs(), (a[1] - b[1]).abs());
+    let [x, y] = [0, 1].map(|axis| free.principal_px[axis] - given.principal_px[axis]);
+    let focal = format!("the focal length changes from {:.1} to {:.1} px", given.focal_px[0], free.focal_px[0]);
+    let principal = format!(
+        "the principal point moves by ({x:.1}, {y:.1}) px from ({:.1}, {:.1})",
+        given.principal_px[0], given.principal_px[1]
+    );
+    match largest(given.principal_px, free.principal_px) > largest(given.focal_px, free.focal_px) {
+        true => format!("{principal}, {focal}"),
+        false => format!("{focal}, {principal}"),
+    }
+}

@@ -1,0 +1,57 @@
+//! Names mistakes in the stamps of a stream: wrong units, rounded stamps, several bodies in one file.
+
+use super::PoseSample;
+use crate::hand_eye::Refusal;
+
+/// Units in which stamps are often given by mistake, and how many make a second.
+const UNITS: [(&str, f64); 3] = [("milliseconds", 1e3), ("microseconds", 1e6), ("nanoseconds", 1e9)];
+/// Times between poses of cameras, trackers and robots, seconds.
+const USUAL_STEPS_SECS: std::ops::RangeInclusive<f64> = 0.0004..=0.4;
+
+/// The unit of stamps that are not seconds. Real steps of several seconds look like milliseconds, so this explains only
+/// streams that are of no use otherwise.
+///
+/// * `step_secs`: typical difference of consecutive stamps.
+pub(super) fn unit_mistake(name: &str, step_secs: f64) -> Option<Refusal> {
+    if USUAL_STEPS_SECS.contains(&step_secs) {
+        return None;
+    }
+    let (unit, per_sec) = UNITS.into_iter().find(|(_, per_sec)| USUAL_STEPS_SECS.contains(&(step_secs / per_sec)))?;
+    Some(Refusal::new(
+        format!(
+            "the stamps of stream {name} are probably in {unit}: they advance by {} from one pose to the next, which is {:.4} s in {unit}",
+            rounded(step_secs),
+            step_secs / per_sec
+        ),
+        format!("divide the stamps by {per_sec:e}, so that they are in seconds"),
+    ))
+}
+
+fn rounded(value: f64) -> String {
+    if value < 1e4 { format!("{value:.1}") } else { format!("{value:.3e}") }
+}
+
+/// Describes stamps that several different poses share. A few of them are dropped.
+pub(super) fn repeated_stamps(name: &str, sorted: &[PoseSample]) -> Option<String> {
+    const MAX_FRAC: f64 = 0.2;
+    const SAME_RAD: f64 = 1e-9;
+    const SAME_M: f64 = 1e-9;
+    let is_conflict = |pair: &&[PoseSample]| {
+        let difference = pair[0].pose.inverse() * pair[1].pose;
+        pair[0].secs == pair[1].secs
+            && (difference.rotation.angle() > SAME_RAD || difference.translation.vector.norm() > SAME_M)
+    };
+    let n_conflicts = sorted.windows(2).filter(is_conflict).count();
+    if n_conflicts as f64 <= MAX_FRAC * sorted.len() as f64 {
+        return None;
+    }
+    let example = sorted.windows(2).find(is_conflict)?[0].secs;
+    let cause = match sorted.iter().all(|sample| sample.secs.fract() == 0.0) {
+        true => "the stamps are probably rounded to whole seconds",
+        false => "the file probably contains several bodies, or its stamps are rounded",
+    };
+    Some(format!(
+        "{n_conflicts} of {} poses of stream {name} have the same stamp as another pose (for example {example}), expected one pose per stamp; {cause}",
+        sorted.len()
+    ))
+}

@@ -1,0 +1,271 @@
+//! Images of one camera for calibration with a target: from devices or a recording, with the pose of the flange.
+//!
+//! Images are kept while the robot is slow and at poses that differ from those of the images before. If the robot has no
+//! arm, images are kept at a fixed interval.
+
+use crate::config::{ArmDriver, Camera, Rig};
+use crate::open::{Opened, chain_of};
+use drivers::{Image, Sample};
+use keyframe::bail;
+use kinematics::{Chain, HistoryError, JointHistory, JointState, Stamp, Transform, transform};
+use std::collections::VecDeque;
+use std::time::Duration;
+
+/// Maximum number of joint readings kept: those of 20 s at 1 kHz.
+const MAX_READINGS: usize = 20_000;
+/// Maximum number of images that wait for joint readings.
+const MAX_WAITING: usize = 64;
+/// Maximum number of images kept.
+const MAX_IMAGES: usize = 300;
+/// Interval between images of a robot without an arm, seconds.
+const INTERVAL_SECS: f64 = 0.5;
+/// Uncertainty of image stamps for the check of the speed, seconds.
+const STAMP_SIGMA_SECS: f64 = 0.002;
+
+/// A gray image.
+#[derive(Clone, Debug)]
+pub struct CalibrationImage {
+    /// Time since the first sample, seconds.
+    pub secs: f64,
+    /// Width and height, pixels.
+    pub size_px: [u32; 2],
+    /// Gray values, row by row.
+    pub gray: Vec<u8>,
+    /// The arm during the exposure; `None` without an arm.
+    pub arm: Option<ArmDuringImage>,
+}
+
+/// State of the arm while an image is exposed.
+#[derive(Clone, Debug)]
+pub struct ArmDuringImage {
+    /// Pose of the flange at mid-exposure.
+    pub base_from_flange: Transform,
+    /// Pose of the flange when the first and the last row are exposed.
+    pub base_from_flange_at_rows: [Transform; 2],
+    /// Joint positions at mid-exposure in the order of the chain, with the offsets of the rig file.
+    pub joints: Vec<f64>,
+}
+
+impl ArmDuringImage {
+    /// Pose of the flange when a row is exposed, 0 to 1 from the first to the last.
+    pub fn base_from_flange_at(&self, row_frac: f64) -> Transform {
+        let [first, last] = &self.base_from_flange_at_rows;
+        transform::interpolate(first, last, row_frac)
+    }
+}
+
+/// The images that were kept, and why others were not.
+#[derive(Debug, Default)]
+pub struct CalibrationImages {
+    /// The images in the order of their stamps.
+    pub images: Vec<CalibrationImage>,
+    /// Number of color images of the camera.
+    pub n_read: usize,
+    /// Number of images during which the arm moved too fast.
+    pub n_fast: usize,
+    /// Number of images without joint readings at their stamp, or that do not decode.
+    pub n_unusable: usize,
+    /// Description of the damage, if the recording ends early.
+    pub damage: Option<String>,
+}
+
+/// Reads the images of a camera until `is_end` returns true or the samples end.
+///
+/// * `max_shift_px`: images of a scene at `join.default_depth_m` that move further during the exposure of all rows are
+///   not kept.
+/// * `on_image`: is called after each image, with the number of images kept.
+///
+/// # Errors
+///
+/// If the rig has no such camera, its base moves, or a device fails.
+pub fn calibration_images(
+    opened: Opened,
+    camera: &str,
+    max_shift_px: f64,
+    mut is_end: impl FnMut(&Sample) -> bool,
+    on_image: &dyn Fn(usize),
+) -> crate::Result<CalibrationImages> {
+    let Opened { rig, mut source, damage, .. } = opened;
+    let mut reader = Reader::new(&rig, camera, max_shift_px)?;
+    while let Some(sample) = source.next_sample()? {
+        if is_end(&sample) {
+            break;
+        }
+        reader.push(sample);
+        on_image(reader.found.images.len());
+    }
+    reader.found.n_unusable += reader.waiting.len();
+    Ok(CalibrationImages { damage: damage.get().cloned(), ..reader.found })
+}
+
+struct Reader<'a> {
+    rig: &'a Rig,
+    camera: &'a Camera,
+    arm: Option<Arm>,
+    max_shift_px: f64,
+    first: Option<Stamp>,
+    /// Images whose last row is exposed after the newest joint reading.
+    waiting: VecDeque<Image>,
+    found: CalibrationImages,
+}
+
+/// Recent joint positions.
+struct Arm {
+    chain: Chain,
+    /// Index of each chain joint in the readings.
+    order: Vec<usize>,
+    joints: JointHistory,
+}
+
+impl<'a> Reader<'a> {
+    fn new(rig: &'a Rig, camera: &str, max_shift_px: f64) -> crate::Result<Self> {
+        let Some(camera) = rig.cameras.iter().find(|other| &*other.name == camera) else {
+            let names: Vec<&str> = rig.cameras.iter().map(|camera| &*camera.name).collect();
+            return Err(crate::Error::BadInput(format!(
+                "the rig has no camera {camera:?}; it has {}",
+                names.join(", ")
+            )));
+        };
+        if rig.has_moving_base() {
+            bail!("the base moves: calibration with a target needs a fixed base (base.driver = \"fixed\")");
+        }
+        let arm = (rig.arm.driver != ArmDriver::None).then(|| Arm::new(rig)).transpose()?;
+        Ok(Self {
+            rig,
+            camera,
+            arm,
+            max_shift_px,
+            first: None,
+            waiting: VecDeque::new(),
+            found: CalibrationImages::default(),
+        })
+    }
+
+    fn push(&mut self, sample: Sample) {
+        self.first.get_or_insert(sample.stamp());
+        match sample {
+            Sample::Joints(state) => {
+                if let Some(arm) = &mut self.arm {
+                    arm.push(&state, &self.rig.arm.joint_offsets);
+                }
+            }
+            Sample::Image(image) if !image.is_depth() && image.camera == self.camera.name => {
+                self.found.n_read += 1;
+                if self.waiting.len() == MAX_WAITING {
+                    self.waiting.pop_front();
+                    self.found.n_unusable += 1;
+                }
+                self.waiting.push_back(image);
+            }
+            _ => return,
+        }
+        while let Some(image) = self.waiting.pop_front() {
+            match self.arm_during(&image) {
+                Err(HistoryError::NotYet { .. }) => {
+                    self.waiting.push_front(image);
+                    break;
+                }
+                Err(_) => self.found.n_unusable += 1,
+                Ok(arm) => self.decide(&image, arm),
+            }
+        }
+    }
+
+    fn readout_secs(&self) -> f64 {
+        1e-6 * self.camera.readout_micros.unwrap_or(0.0)
+    }
+
+    fn arm_during(&self, image: &Image) -> Result<Option<ArmDuringImage>, HistoryError> {
+        let Some(arm) = &self.arm else { return Ok(None) };
+        let mid = self.camera.mid_exposure(image.stamp);
+        let half_secs = 0.5 * self.readout_secs();
+        let [first, middle, last] = [-half_secs, 0.0, half_secs].map(|secs| arm.joints.at(mid.plus_secs(secs)));
+        let (first, middle, last) = (first?, middle?, last?);
+        // Readings have as many joints as the chain.
+        let forward = |joints: &JointState| arm.chain.forward(&joints.position).unwrap_or_default();
+        Ok(Some(ArmDuringImage {
+            base_from_flange: forward(&middle),
+            base_from_flange_at_rows: [forward(&first), forward(&last)],
+            joints: middle.position,
+        }))
+    }
+
+    fn decide(&mut self, image: &Image, arm: Option<ArmDuringImage>) {
+        let secs = self.first.map_or(0.0, |first| image.stamp.secs_since(first));
+        if self.found.images.len() >= MAX_IMAGES || !self.is_different(secs, arm.as_ref()) {
+            return;
+        }
+        if arm.as_ref().is_some_and(|arm| self.shift_px(image, arm) > self.max_shift_px) {
+            self.found.n_fast += 1;
+            return;
+        }
+        let Ok(rgb) = image.decode_rgb() else {
+            self.found.n_unusable += 1;
+            return;
+        };
+        let gray = rgb.chunks_exact(3).map(luma).collect();
+        self.found.images.push(CalibrationImage { secs, size_px: image.size_px, gray, arm });
+    }
+
+    /// Whether the pose differs from those of all images kept; without an arm, whether the last one is old enough.
+    fn is_different(&self, secs: f64, arm: Option<&ArmDuringImage>) -> bool {
+        let join = &self.rig.join;
+        let Some(arm) = arm else {
+            return self.found.images.last().is_none_or(|last| secs - last.secs >= INTERVAL_SECS);
+        };
+        let is_near = |other: &ArmDuringImage| {
+            let motion = other.base_from_flange.inverse() * arm.base_from_flange;
+            motion.translation.vector.norm() < join.min_translation_m && motion.rotation.angle() < join.min_rotation_rad
+        };
+        !self.found.images.iter().filter_map(|image| image.arm.as_ref()).any(is_near)
+    }
+
+    /// Predicted motion of the image from the first to the last exposed instant, and within the error of the stamp.
+    fn shift_px(&self, image: &Image, arm: &ArmDuringImage) -> f64 {
+        let [first, last] = &arm.base_from_flange_at_rows;
+        let readout_secs = self.readout_secs();
+        let exposure_secs = image.exposure_secs.or(self.camera.exposure_micros.map(|micros| 1e-6 * micros));
+        let (motion, secs) = match (&self.arm, readout_secs > 0.0) {
+            // Without a readout time, the motion since a short time before.
+            (Some(history), false) => {
+                let earlier = self.camera.mid_exposure(image.stamp).plus_secs(-STAMP_SIGMA_SECS);
+                let joints = history.joints.at(earlier).map(|joints| joints.position).unwrap_or_default();
+                let before = history.chain.forward(&joints).unwrap_or(arm.base_from_flange);
+                (before.inverse() * arm.base_from_flange, STAMP_SIGMA_SECS)
+            }
+            _ => (first.inverse() * last, readout_secs),
+        };
+        let focal_px = self.camera.intrinsics.focal_px[0];
+        let angle = motion.rotation.angle() + motion.translation.vector.norm() / self.rig.join.default_depth_m;
+        focal_px * angle / secs * (readout_secs + exposure_secs.unwrap_or(0.0) + STAMP_SIGMA_SECS)
+    }
+}
+
+impl Arm {
+    fn new(rig: &Rig) -> crate::Result<Self> {
+        let chain = chain_of(rig)?;
+        let order = chain.order_in(&rig.arm.joints)?;
+        let max_gap = Duration::from_secs_f64(rig.join.max_gap_millis * 1e-3);
+        Ok(Self { chain, order, joints: JointHistory::new(max_gap, MAX_READINGS) })
+    }
+
+    /// Adds a reading in the order of the device. Invalid readings are ignored: images at their stamps are not used.
+    fn push(&mut self, state: &JointState, offsets: &[f64]) {
+        let position = self.order.iter().map(|ix| {
+            let offset = offsets.get(*ix).copied().unwrap_or(0.0);
+            state.position.get(*ix).map(|reading| reading + offset)
+        });
+        let velocity = self.order.iter().map(|ix| state.velocity.get(*ix).copied()).collect::<Option<Vec<f64>>>();
+        if let Some(position) = position.collect::<Option<Vec<f64>>>() {
+            let velocity = velocity.unwrap_or_default();
+            let _ = self.joints.push(JointState { stamp: state.stamp, position, velocity, effort: Vec::new() });
+        }
+    }
+}
+
+/// Luma of an sRGB pixel (ITU-R BT.601).
+#[expect(clippy::cast_possible_truncation, reason = "a weighted mean of bytes")]
+fn luma(rgb: &[u8]) -> u8 {
+    let sum = 299 * u32::from(rgb[0]) + 587 * u32::from(rgb[1]) + 114 * u32::from(rgb[2]);
+    ((sum + 500) / 1000) as u8
+}

@@ -1,0 +1,78 @@
+//! Reports of calibrations: one page each that works offline, with the result, its uncertainty, the errors of all samples
+//! and, if the calibration was refused, the reason and the data that it is based on.
+
+mod bars;
+mod hand_eye;
+mod image_map;
+mod intrinsics;
+mod page;
+mod photo;
+mod scatter;
+mod scene;
+mod time_offset;
+
+pub use hand_eye::HandEyeReport;
+pub use intrinsics::IntrinsicsReport;
+pub use photo::{Photo, Photos};
+pub use scene::SceneReport;
+pub use time_offset::TimeOffsetReport;
+
+use crate::{Error, run_folder};
+use std::path::Path;
+
+/// What all reports begin with.
+#[derive(Clone, Debug)]
+pub struct Heading {
+    /// The input: a folder or file.
+    pub input: String,
+    /// Why there is no result. `None` if there is one.
+    pub refused: Option<String>,
+    /// Problems that do not invalidate the result.
+    pub warnings: Vec<String>,
+}
+
+/// A measurement that was not used.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Unused {
+    /// Name of the image or sample.
+    pub name: String,
+    /// Why it was not used.
+    pub reason: String,
+}
+
+/// Checks that a report can be written to this path.
+///
+/// # Errors
+/// [`Error::BadInput`] if it cannot.
+pub fn check_target_file(file: &Path) -> Result<(), Error> {
+    let folder = file.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let is_page = file.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("html"));
+    match folder.is_dir() && !file.is_dir() && is_page {
+        true => Ok(()),
+        false => Err(Error::BadInput(format!(
+            "--report {}: must be a file with the extension .html in an existing folder",
+            file.display()
+        ))),
+    }
+}
+
+/// Writes a page atomically.
+///
+/// # Errors
+/// If the file cannot be written.
+pub fn write(file: &Path, html: &str) -> crate::Result<()> {
+    run_folder::write_atomic(file, html)
+}
+
+/// A number with a fixed number of decimals; a dash if it is unknown.
+fn number(value: Option<f64>, digits: usize) -> String {
+    match value.filter(|value| value.is_finite()) {
+        Some(value) => format!("{value:.digits$}"),
+        None => "–".to_owned(),
+    }
+}
+
+/// A value with its standard deviation.
+fn with_sigma(value: f64, sigma: f64, digits: usize) -> String {
+    format!("{value:.digits$} ± {sigma:.digits$}")
+}

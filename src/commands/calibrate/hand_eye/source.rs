@@ -1,0 +1,98 @@
+//! Samples of `fieldrig calibrate hand-eye` from a file, a recording or devices.
+
+use super::super::scan::Scan;
+use super::samples_file::{Samples, SamplesFile};
+use calibration::hand_eye::Setup;
+use kinematics::{Chain, Intrinsics, Transform};
+use targets::TargetSpec;
+
+/// Where the samples come from.
+pub(super) enum Source {
+    File(SamplesFile),
+    /// A recording or the devices of a rig.
+    Scan {
+        scan: Box<Scan>,
+        target: TargetSpec,
+    },
+}
+
+impl Source {
+    pub(super) fn setup(&self) -> Setup {
+        match self {
+            Self::File(file) => file.setup,
+            Self::Scan { scan, .. } => scan.setup(),
+        }
+    }
+
+    pub(super) fn target(&self) -> Option<&TargetSpec> {
+        match self {
+            Self::File(file) => file.target.as_ref(),
+            Self::Scan { target, .. } => Some(target),
+        }
+    }
+
+    /// Number of samples, including those whose image does not show the target.
+    pub(super) fn n_samples(&self) -> usize {
+        match self {
+            Self::File(file) => file.len(),
+            Self::Scan { scan, .. } => scan.n_images(),
+        }
+    }
+
+    /// Kinematics of the arm, if the rig has one.
+    pub(super) fn chain(&self) -> Option<&Chain> {
+        match self {
+            Self::File(_) => None,
+            Self::Scan { scan, .. } => scan.chain(),
+        }
+    }
+
+    /// The given intrinsics. `None` without images.
+    pub(super) fn intrinsics(&self, size_px: Option<[u32; 2]>) -> anyhow::Result<Option<Intrinsics>> {
+        match (self, size_px) {
+            (Self::Scan { scan, .. }, _) => Ok(Some(scan.intrinsics().clone())),
+            (Self::File(file), Some(size_px)) => {
+                Ok(file.intrinsics.as_ref().map(|lens| lens.intrinsics(size_px)).transpose()?)
+            }
+            (Self::File(_), None) => Ok(None),
+        }
+    }
+
+    /// Problems of the input that do not prevent a calibration.
+    pub(super) fn warnings(&self) -> &[String] {
+        match self {
+            Self::File(_) => &[],
+            Self::Scan { scan, .. } => &scan.warnings,
+        }
+    }
+
+    /// Detects the target in all images of a file; a scan has done so.
+    ///
+    /// * `is_hidden`: no progress bar.
+    pub(super) fn samples(&mut self, is_hidden: bool) -> anyhow::Result<Samples> {
+        match self {
+            Self::File(file) => file.detect(is_hidden),
+            Self::Scan { scan, .. } => {
+                let (used, unused) = scan.samples(None);
+                let size_px = Some(scan.intrinsics().size_px);
+                Ok(Samples { used, unused, size_px, photos: scan.take_photos() })
+            }
+        }
+    }
+
+    /// An error if there is no image, or if no image shows the target.
+    pub(super) fn check(&self, samples: &Samples) -> anyhow::Result<()> {
+        match self {
+            Self::File(file) => Ok(file.check_detected(samples)?),
+            Self::Scan { scan, .. } => Ok(scan.check()?),
+        }
+    }
+
+    /// `parent_from_camera` of a rig file for an estimated pose.
+    pub(super) fn rig_pose(&self, parent_from_camera: &Transform) -> Transform {
+        match self {
+            Self::File(_) => *parent_from_camera,
+            Self::Scan { scan, .. } => scan.rig_pose(parent_from_camera),
+        }
+    }
+}

@@ -1,0 +1,148 @@
+//! Reads JSON objects, with errors that name the file and the field.
+
+use super::transform_of;
+use crate::exit::BadArgument;
+use kinematics::Transform;
+use serde_json::{Map, Value};
+
+/// An object in a JSON file.
+#[derive(Clone, Debug)]
+pub(super) struct JsonObject<'a> {
+    file: &'a str,
+    /// Where the object is in the file, such as `samples[3]`; empty for the whole file.
+    path: String,
+    map: &'a Map<String, Value>,
+}
+
+/// A key that is less similar to a known one is not a misspelling of it.
+const MIN_SIMILARITY: f64 = 0.75;
+
+impl<'a> JsonObject<'a> {
+    /// Rejects other values, and keys other than `known`.
+    pub(super) fn new(file: &'a str, path: String, value: &'a Value, known: &[&str]) -> Result<Self, BadArgument> {
+        let place = if path.is_empty() { file.to_owned() } else { format!("{file}: {path}") };
+        let Some(map) = value.as_object() else {
+            return Err(BadArgument(format!("{place}: {}, expected an object", kind_of(value))));
+        };
+        if let Some(unknown) = map.keys().find(|key| !known.contains(&key.as_str())) {
+            let similarity = |key: &str| strsim::jaro_winkler(key, unknown);
+            let nearest = known.iter().copied().max_by(|a, b| similarity(a).total_cmp(&similarity(b)));
+            let hint = match nearest.filter(|key| similarity(key) >= MIN_SIMILARITY) {
+                Some(key) => format!("did you mean {key:?}?"),
+                None => format!("the keys are {}", known.join(", ")),
+            };
+            return Err(BadArgument(format!("{place}: unknown key {unknown:?}; {hint}")));
+        }
+        Ok(Self { file, path, map })
+    }
+
+    /// An error about a field.
+    pub(super) fn invalid(&self, key: &str, why: impl std::fmt::Display) -> BadArgument {
+        BadArgument(format!("{}: {}: {why}", self.file, self.path_of(key)))
+    }
+
+    fn path_of(&self, key: &str) -> String {
+        if self.path.is_empty() { key.to_owned() } else { format!("{}.{key}", self.path) }
+    }
+
+    /// The value of a field. `null` counts as missing.
+    pub(super) fn get(&self, key: &str) -> Option<&'a Value> {
+        self.map.get(key).filter(|value| !value.is_null())
+    }
+
+    pub(super) fn required<T>(&self, key: &str, value: Option<T>) -> Result<T, BadArgument> {
+        value.ok_or_else(|| self.invalid(key, "missing"))
+    }
+
+    pub(super) fn text(&self, key: &str) -> Result<Option<&'a str>, BadArgument> {
+        let text = |value: &'a Value| {
+            value.as_str().ok_or_else(|| self.invalid(key, format!("{}, expected a text", kind_of(value))))
+        };
+        self.get(key).map(text).transpose()
+    }
+
+    pub(super) fn numbers(&self, key: &str) -> Result<Option<Vec<f64>>, BadArgument> {
+        let Some(value) = self.get(key) else { return Ok(None) };
+        let Some(list) = value.as_array() else {
+            return Err(self.invalid(key, format!("{}, expected a list of numbers", kind_of(value))));
+        };
+        let numbers: Option<Vec<f64>> = list.iter().map(Value::as_f64).collect();
+        numbers.map(Some).ok_or_else(|| self.invalid(key, "expected a list of numbers"))
+    }
+
+    pub(super) fn array<const N: usize>(&self, key: &str) -> Result<Option<[f64; N]>, BadArgument> {
+        let Some(numbers) = self.numbers(key)? else { return Ok(None) };
+        let n = numbers.len();
+        numbers.try_into().map(Some).map_err(|_| self.invalid(key, format!("{n} numbers, expected {N}")))
+    }
+
+    pub(super) fn transform(&self, key: &str) -> Result<Option<Transform>, BadArgument> {
+        self.get(key).map(|value| transform_of(value).map_err(|why| self.invalid(key, why))).transpose()
+    }
+
+    pub(super) fn list(&self, key: &str) -> Result<&'a [Value], BadArgument> {
+        let value = self.required(key, self.get(key))?;
+        let list = value.as_array().ok_or_else(|| self.invalid(key, format!("{}, expected a list", kind_of(value))))?;
+        Ok(list)
+    }
+
+    /// The object in a field.
+    pub(super) fn object(&self, key: &str, known: &[&str]) -> Result<Option<Self>, BadArgument> {
+        self.get(key).map(|value| Self::new(self.file, self.path_of(key), value, known)).transpose()
+    }
+
+    /// The objects in a list.
+    pub(super) fn objects(&self, key: &str, known: &[&str]) -> Result<Vec<Self>, BadArgument> {
+        let path = self.path_of(key);
+        let object = |(ix, value): (usize, &'a Value)| Self::new(self.file, format!("{path}[{ix}]"), value, known);
+        self.list(key)?.iter().enumerate().map(object).collect()
+    }
+}
+
+fn kind_of(value: &Value) -> &'static str {
+    match value {
+        Value::Null => "null",
+        Value::Bool(_) => "a truth value",
+        Value::Number(_) => "a number",
+        Value::String(_) => "a text",
+        Value::Array(_) => "a list",
+        Value::Object(_) => "an object",
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use serde_json::json;
+
+    fn error<T>(result: Result<T, BadArgument>) -> String {
+        result.err().expect("an error").to_string()
+    }
+
+    #[test]
+    fn errors_name_the_field() {
+        let value = json!({"samples": [{}, {"base_from_flange": [[1, 2]], "image": 7, "joints": [1, "2"]}]});
+        let file = JsonObject::new("s.json", String::new(), &value, &["samples"]).expect("an object");
+        let known = ["base_from_flange", "image", "joints"];
+        let samples = file.objects("samples", &known).expect("objects");
+        assert_eq!(error(samples[1].text("image")), "s.json: samples[1].image: a number, expected a text");
+        assert!(error(samples[1].numbers("joints")).starts_with("s.json: samples[1].joints: expected"));
+        assert!(
+            error(samples[1].transform("base_from_flange")).contains("samples[1].base_from_flange: must be a matrix")
+        );
+        assert_eq!(error(samples[0].required("image", samples[0].get("image"))), "s.json: samples[0].image: missing");
+        let bad = json!({"samples": [{"base_to_flange": 1}]});
+        let file = JsonObject::new("s.json", String::new(), &bad, &["samples"]).expect("an object");
+        let message = error(file.objects("samples", &known));
+        assert!(
+            message.contains("samples[0]: unknown key \"base_to_flange\"; did you mean \"base_from_flange\"?"),
+            "{message}"
+        );
+        let message = error(JsonObject::new("s.json", String::new(), &json!({"zzz": 1}), &["samples", "setup"]));
+        assert_eq!(message, "s.json: unknown key \"zzz\"; the keys are samples, setup");
+        assert_eq!(
+            error(JsonObject::new("s.json", String::new(), &json!([]), &[])),
+            "s.json: a list, expected an object"
+        );
+    }
+}

@@ -1,0 +1,246 @@
+//! Images of a target from a recording or from the devices of a rig, as input of `calibrate intrinsics` and `calibrate
+//! hand-eye`.
+
+use super::images::{self, DetectedImage};
+use super::outputs::{InputKind, RigFlags, RigOutput};
+use crate::exit::{BadArgument, InsufficientData};
+use crate::{print, signals};
+use calibration::BoardView;
+use calibration::hand_eye::{BoardObservation, FlangeMotion, HandEyeSample, Setup, corners_at_mid_exposure};
+use capture::config::{Camera, Override, Parent, Rig};
+use capture::open::{self, Devices, Opened};
+use capture::{ArmDuringImage, CalibrationImage, CalibrationImages, calibration_images};
+use drivers::Sample;
+use kinematics::{Chain, Intrinsics, Stamp, Transform};
+use session::calibration_report::{Photo, Photos, Unused};
+use std::path::Path;
+use targets::{GrayImage, TargetSpec};
+
+/// Time for which devices are read if no flag limits it, seconds.
+const DEFAULT_SECS: f64 = 30.0;
+/// Images that move further during the exposure of all rows are not used, pixels.
+const MAX_SHIFT_PX: f64 = 3.0;
+
+/// Images of one camera in which a target was searched.
+pub(super) struct Scan {
+    rig: Rig,
+    camera: Camera,
+    setup: Setup,
+    /// Pose of the camera on the flange or in the base, from the rig file.
+    parent_from_camera: Transform,
+    chain: Option<Chain>,
+    images: Vec<(DetectedImage, Option<ArmDuringImage>)>,
+    /// The images, if they were requested.
+    photos: Photos,
+    /// Why there are no images.
+    pub(super) no_images: Option<String>,
+    /// Damage of the recording.
+    pub(super) warnings: Vec<String>,
+}
+
+/// What to do while images are read.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct ScanOptions {
+    /// Keeps the images for a report.
+    pub(super) keeps_photos: bool,
+    /// No progress bars.
+    pub(super) is_hidden: bool,
+}
+
+impl RigFlags {
+    /// Reads a recording, or the devices of a rig. `None` if the input is neither.
+    ///
+    /// * `output`: gets the calibration that devices report.
+    pub(super) fn read(
+        &self,
+        input: &Path,
+        target: Option<&TargetSpec>,
+        options: ScanOptions,
+        output: Option<&mut RigOutput>,
+    ) -> anyhow::Result<Option<Scan>> {
+        self.check(input)?;
+        let kind = InputKind::of(input);
+        if kind == InputKind::Files {
+            return Ok(None);
+        }
+        session::expect(input)?;
+        let Some(target) = target else {
+            let example = "such as charuco:5x7:34mm:26mm:5X5_100";
+            return Err(BadArgument(format!("{}: --target is missing, {example}", input.display())).into());
+        };
+        let opened = match kind {
+            InputKind::Rig => self.open_devices(input)?,
+            InputKind::Recording | InputKind::Files => {
+                let rig = self.rig.as_deref().map(|file| Rig::load(file, &[])).transpose()?;
+                open::recording(input, rig, &[])?
+            }
+        };
+        let rig = opened.rig.clone();
+        if let Some(output) = output.filter(|_| kind == InputKind::Rig && !self.sim) {
+            output.set_rig(&rig);
+        }
+        let camera = self.camera_of(&rig)?.clone();
+        let found = self.images(opened, &camera.name, options.is_hidden)?;
+        let warnings = Vec::from_iter(found.damage.clone());
+        for warning in &warnings {
+            log::warn!("{warning}");
+        }
+        log::info!(
+            "{} of {} images used: the others show the same pose, the arm moves too fast in {}, and {} have no robot pose",
+            found.images.len(),
+            found.n_read,
+            found.n_fast,
+            found.n_unusable
+        );
+        let no_images = found.images.is_empty().then(|| no_images(input, &camera, &found));
+        let scan = Scan::detect(rig, camera, found, target, options)?;
+        Ok(Some(Scan { no_images, warnings, ..scan }))
+    }
+
+    fn open_devices(&self, rig_file: &Path) -> anyhow::Result<Opened> {
+        let overrides = if self.sim { vec![Override::new("sim.lockstep", true)] } else { Vec::new() };
+        let rig = Rig::load(rig_file, &overrides)?;
+        Ok(open::rig(rig, if self.sim { Devices::Sim } else { Devices::Real })?)
+    }
+
+    fn images(&self, opened: Opened, camera: &str, is_hidden: bool) -> anyhow::Result<CalibrationImages> {
+        let bar = print::bar(None, "{spinner} {pos} images", is_hidden);
+        let stop = signals::stop_on_signals_logging("calibrating with the images so far; Ctrl-C again exits at once")?;
+        let is_live = !matches!(opened.stamp_clock, capture::StampClock::Unrelated);
+        let limit_secs = if is_live { self.seconds.unwrap_or(DEFAULT_SECS) } else { f64::INFINITY };
+        let mut first: Option<Stamp> = None;
+        let is_end = |sample: &Sample| {
+            let since_first = sample.stamp().secs_since(*first.get_or_insert(sample.stamp()));
+            since_first > limit_secs || stop.requested()
+        };
+        let found = calibration_images(opened, camera, MAX_SHIFT_PX, is_end, &|n| bar.set_position(n as u64));
+        bar.finish_and_clear();
+        Ok(found?)
+    }
+}
+
+fn no_images(input: &Path, camera: &Camera, found: &CalibrationImages) -> String {
+    let (input, name) = (input.display(), &camera.name);
+    match (found.n_read, found.n_fast) {
+        (0, _) => format!("{input}: no image of camera {name:?}"),
+        (_, 0) => format!("{input}: camera {name:?}: no joint readings at the stamps of {} images", found.n_read),
+        (_, n) => format!(
+            "{input}: camera {name:?}: the arm moves too fast in {n} images (more than {MAX_SHIFT_PX} px); stop it at each pose"
+        ),
+    }
+}
+
+impl Scan {
+    fn detect(
+        rig: Rig,
+        camera: Camera,
+        found: CalibrationImages,
+        target: &TargetSpec,
+        options: ScanOptions,
+    ) -> anyhow::Result<Self> {
+        let detected = images::detect_each(&found.images, options.is_hidden, |image| {
+            let name = format!("image at {:.3} s", image.secs);
+            let gray = GrayImage { size_px: image.size_px, pixels: &image.gray };
+            let board = images::detect_in_gray(gray, &name, target);
+            DetectedImage { name, board }
+        });
+        let base_from_world = rig.base.world_from_base.inverse();
+        let (setup, parent_from_camera) = match camera.parent {
+            Parent::Flange => (Setup::EyeInHand, camera.parent_from_camera),
+            Parent::Base => (Setup::EyeToHand, camera.parent_from_camera),
+            Parent::World => (Setup::EyeToHand, base_from_world * camera.parent_from_camera),
+        };
+        let (mut photos, mut images) = (Photos::new(), Vec::new());
+        for (image, detected) in found.images.into_iter().zip(detected) {
+            let CalibrationImage { size_px, gray, arm, .. } = image;
+            if options.keeps_photos {
+                photos.insert(detected.name.clone(), Photo::Gray { size_px, pixels: gray });
+            }
+            images.push((detected, arm));
+        }
+        let chain = images.iter().any(|(_, arm)| arm.is_some()).then(|| open::chain_of(&rig)).transpose()?;
+        let (no_images, warnings) = (None, Vec::new());
+        Ok(Self { rig, camera, setup, parent_from_camera, chain, images, photos, no_images, warnings })
+    }
+
+    pub(super) fn setup(&self) -> Setup {
+        self.setup
+    }
+
+    pub(super) fn chain(&self) -> Option<&Chain> {
+        self.chain.as_ref()
+    }
+
+    pub(super) fn intrinsics(&self) -> &Intrinsics {
+        &self.camera.intrinsics
+    }
+
+    pub(super) fn n_images(&self) -> usize {
+        self.images.len()
+    }
+
+    /// Takes the images, if they were requested.
+    pub(super) fn take_photos(&mut self) -> Photos {
+        std::mem::take(&mut self.photos)
+    }
+
+    /// An error if no image can be used.
+    pub(super) fn check(&self) -> Result<(), InsufficientData> {
+        self.no_images.clone().map_or(Ok(()), |reason| Err(InsufficientData(reason)))
+    }
+
+    /// `parent_from_camera` of the rig file for an estimated pose, which is relative to the flange or base.
+    pub(super) fn rig_pose(&self, parent_from_camera: &Transform) -> Transform {
+        match self.camera.parent {
+            Parent::World => self.rig.base.world_from_base * parent_from_camera,
+            Parent::Flange | Parent::Base => *parent_from_camera,
+        }
+    }
+
+    /// The images, with corners corrected for a rolling shutter.
+    pub(super) fn detected(&mut self) -> Vec<DetectedImage> {
+        let images = std::mem::take(&mut self.images);
+        let corrected = |(mut image, arm): (DetectedImage, Option<ArmDuringImage>)| {
+            if let (Ok(board), Some(arm)) = (&mut image.board, arm) {
+                board.view = self.at_mid_exposure(&board.view, &arm, &self.parent_from_camera);
+            }
+            image
+        };
+        images.into_iter().map(corrected).collect()
+    }
+
+    /// Samples for hand-eye calibration, and the images without target with the reasons. `parent_from_camera`: pose of
+    /// the camera, if it is known better than in the rig file.
+    pub(super) fn samples(&self, parent_from_camera: Option<&Transform>) -> (Vec<HandEyeSample>, Vec<Unused>) {
+        let (mut samples, mut unused) = (Vec::new(), Vec::new());
+        for (image, arm) in &self.images {
+            let name = image.name.clone();
+            match (&image.board, arm) {
+                (Ok(board), Some(arm)) => {
+                    let camera_pose = parent_from_camera.unwrap_or(&self.parent_from_camera);
+                    let view = self.at_mid_exposure(&board.view, arm, camera_pose);
+                    samples.push(HandEyeSample {
+                        name,
+                        base_from_flange: arm.base_from_flange,
+                        board: BoardObservation::View(view),
+                        joints: Some(arm.joints.clone()),
+                    });
+                }
+                (Err(reason), _) => unused.push(Unused { name, reason: reason.to_string() }),
+                (_, None) => unused.push(Unused { name, reason: "the robot has no arm".to_owned() }),
+            }
+        }
+        (samples, unused)
+    }
+
+    fn at_mid_exposure(&self, view: &BoardView, arm: &ArmDuringImage, parent_from_camera: &Transform) -> BoardView {
+        let motion = FlangeMotion {
+            setup: self.setup,
+            base_from_flange: arm.base_from_flange,
+            base_from_flange_at: &|row_frac| arm.base_from_flange_at(row_frac),
+            parent_from_camera: *parent_from_camera,
+        };
+        let points = corners_at_mid_exposure(&self.camera.intrinsics, &view.points, &motion);
+        BoardView { points, ..view.clone() }
+    }
+}

@@ -1,0 +1,185 @@
+//! `fieldrig calibrate intrinsics` and `hand-eye` from a simulated scan of a printed target, against the truth.
+#![cfg(feature = "sim")]
+
+use kinematics::{Transform, transform};
+use nalgebra::{Quaternion, UnitQuaternion, Vector3};
+use serde_json::Value;
+use std::path::Path;
+use std::process::{Command, Output};
+
+const TARGET: &str = "charuco:5x7:24mm:18mm:5X5_100";
+
+fn fieldrig(folder: &Path, args: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_fieldrig")).args(args).current_dir(folder).output().expect("fieldrig starts")
+}
+
+fn json_of(output: &Output) -> Value {
+    let text = String::from_utf8_lossy(&output.stdout);
+    serde_json::from_str(&text).unwrap_or_else(|error| panic!("{error}: {text}{}", stderr(output)))
+}
+
+fn stderr(output: &Output) -> String {
+    String::from_utf8_lossy(&output.stderr).into_owned()
+}
+
+fn numbers(value: &Value) -> Vec<f64> {
+    let inner = |values: &Vec<Value>| values.iter().flat_map(numbers).collect();
+    value.as_array().map_or_else(|| value.as_f64().into_iter().collect(), inner)
+}
+
+/// `rigs/calibration-board.toml` with changed tables `[sim]` and `[camera.wrist]`.
+fn write_rig(folder: &Path, file: &str, change: impl FnOnce(&mut toml::Table)) {
+    let rigs = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs");
+    let text = std::fs::read_to_string(rigs.join("calibration-board.toml")).expect("a bundled rig file");
+    let mut rig: toml::Table = text.parse().expect("TOML");
+    rig["arm"]["urdf"] = rigs.join("robots/panda.urdf").display().to_string().into();
+    change(&mut rig);
+    std::fs::write(folder.join(file), rig.to_string()).expect("the disk has space");
+}
+
+fn true_pose() -> Transform {
+    let rotation = Quaternion::new(0.6408563820557885, 0.29883623873011983, 0.29883623873011983, 0.6408563820557885);
+    Transform::from_parts(Vector3::new(0.06, 0.0, 0.045).into(), UnitQuaternion::from_quaternion(rotation))
+}
+
+#[test]
+fn lens_and_hand_eye_of_a_moving_arm_are_found_from_a_printed_target() {
+    const MAX_SIGMAS: f64 = 4.0;
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    write_rig(folder, "rig.toml", |rig| {
+        let sim = rig["sim"].as_table_mut().expect("a table");
+        sim.insert("duration_secs".into(), 24.5.into());
+        sim.insert("lockstep".into(), true.into());
+    });
+    let output = fieldrig(folder, &["record", "rig.toml", "--sim", "--out", "scan.mcap"]);
+    assert!(output.status.success(), "{}", stderr(&output));
+    let files = ["--write-rig", "calibrated.toml", "--report", "lens.html"];
+    let args = ["calibrate", "intrinsics", "scan.mcap", "--target", TARGET, "--json"];
+    let output = fieldrig(folder, &[&args[..], &files].concat());
+    assert!(output.status.success(), "{}", stderr(&output));
+    assert!(is_report_with_photo(folder, "lens.html"));
+    let lens = json_of(&output);
+    for (truth, (key, axis), name) in [
+        (614.6, ("focal_px", 0), "fx"),
+        (614.2, ("focal_px", 1), "fy"),
+        (323.7, ("principal_px", 0), "cx"),
+        (236.4, ("principal_px", 1), "cy"),
+    ] {
+        let error = lens[key][axis].as_f64().expect("a number") - truth;
+        let sigma = lens["sigma"][name].as_f64().expect("a number");
+        assert!(error.abs() < MAX_SIGMAS * sigma && sigma < 0.5, "{name}: off by {error} px, stated {sigma} px");
+    }
+
+    // From the recording and from the simulated devices; the result of the latter is written.
+    let files = ["--report", "hand-eye.html", "--write-rig", "result.toml"];
+    for input in [&["scan.mcap", "--rig", "calibrated.toml"][..], &["calibrated.toml", "--sim", "--seconds", "24.5"]] {
+        let args = [&["calibrate", "hand-eye"], input, &["--target", TARGET, "--json"], &files].concat();
+        let output = fieldrig(folder, &args);
+        assert!(output.status.success(), "{input:?}: {}", stderr(&output));
+        assert!(is_report_with_photo(folder, "hand-eye.html"), "{input:?}");
+        check_pose(&json_of(&output));
+    }
+    let text = std::fs::read_to_string(folder.join("result.toml")).expect("a rig file");
+    let rig: toml::Table = text.parse().expect("TOML");
+    let camera = &rig["camera"]["wrist"];
+    let value = |key: &str, list: &str, ix: usize| camera[key][list][ix].as_float().expect("a number");
+    let (focal_px, x_m) = (value("intrinsics", "focal_px", 0), value("parent_from_camera", "xyz_m", 0));
+    assert!((focal_px - 614.6).abs() < 1.0 && (x_m - 0.06).abs() < 2e-4, "{text}");
+    assert!(folder.join("result.toml.old").exists());
+}
+
+/// Whether a report contains at least one image.
+fn is_report_with_photo(folder: &Path, file: &str) -> bool {
+    std::fs::read_to_string(folder.join(file)).expect("a report").contains("data:image/jpeg")
+}
+
+fn check_pose(result: &Value) {
+    const MAX_SIGMAS: f64 = 4.0;
+    let found = numbers(&result["flange_from_camera"]).try_into().expect("16 numbers");
+    let error = true_pose().inverse() * transform::from_rows(&found).expect("a rigid transform");
+    let errors_mm = error.translation.vector * 1e3;
+    let errors_deg = error.rotation.scaled_axis().map(f64::to_degrees);
+    assert!(errors_mm.norm() < 0.2 && errors_deg.norm() < 0.03, "{errors_mm} mm, {errors_deg} degrees");
+    for (errors, key) in [(errors_mm, "sigma_mm"), (errors_deg, "sigma_deg")] {
+        for (axis, sigma) in numbers(&result[key]).into_iter().enumerate() {
+            let error = errors[axis].abs();
+            assert!(error < MAX_SIGMAS * sigma, "{key}: axis {axis} is off by {error}, stated {sigma}");
+        }
+    }
+}
+
+#[test]
+fn unusable_scans_are_rejected_with_the_reason() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    write_rig(folder, "bad.toml", |rig| rig["sim"]["target"]["board"]["spec"] = "charuco:5x7:24:18mm:5X5_100".into());
+    write_rig(folder, "rig.toml", |_| ());
+    for (args, expected) in [
+        (&["bad.toml", "--sim", "--target", TARGET][..], "sim.target.board"),
+        (&["rig.toml", "--sim"], "--target is missing"),
+        (&["samples.json", "--with-joints"], "--urdf and --tip are needed"),
+        (&["rig.toml", "--sim", "--target", TARGET, "--urdf", "a.urdf", "--tip", "b"], "names the robot description"),
+        (&["rig.toml", "--sim", "--target", TARGET, "--camera", "front"], "it has wrist"),
+        (&["samples.json", "--sim", "--target", TARGET], "--sim and --seconds need a rig file"),
+        (&["rig.toml", "--sim", "--target", TARGET, "--rig", "rig.toml"], "is a rig file, which is used; remove --rig"),
+        (&["rig.toml", "--sim", "--target", TARGET, "--write-rig", "absent/rig.toml"], "in an existing folder"),
+        (&["samples.json", "--write-rig", "new.toml"], "name the one to change with --rig"),
+        (&["samples.json", "--rig", "rig.toml"], "add --write-rig"),
+    ] {
+        let output = fieldrig(folder, &[&["calibrate", "hand-eye"], args].concat());
+        let printed = stderr(&output);
+        assert!(matches!(output.status.code(), Some(1 | 2)) && printed.contains(expected), "{args:?}: {printed}");
+    }
+}
+
+/// Two RGB-D cameras on the flange, both wrong by 3 degrees.
+#[test]
+fn scene_calibration_reports_the_pose_between_two_cameras() {
+    const SIDE: [f64; 3] = [-0.064, 0.037, 0.045];
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    let wrong_rotation = [0.3221026151663075, 0.295552456206855, 0.6424378557492378, 0.6294221575647319];
+    let right_rotation = [0.29883623873011983, 0.29883623873011983, 0.6408563820557885, 0.6408563820557885];
+    let camera = |name: &str, given_m: [f64; 3], given: [f64; 4], true_m: [f64; 3], truth: [f64; 4]| {
+        format!(
+            "[camera.{name}]\ndriver = \"sim\"\nsize_px = [160, 120]\nrate_hz = 8\nexposure_micros = 1000\n\
+             readout_micros = 15000\nparent = \"flange\"\n\
+             parent_from_camera = {{ xyz_m = {given_m:?}, quat_xyzw = {given:?} }}\n\
+             intrinsics = {{ focal_px = [153.65, 153.55], principal_px = [80.925, 59.1], lens = \"pinhole\" }}\n\
+             [camera.{name}.depth]\n[camera.{name}.sim.truth]\n\
+             parent_from_camera = {{ xyz_m = {true_m:?}, quat_xyzw = {truth:?} }}\n"
+        )
+    };
+    let urdf = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs/robots/panda.urdf");
+    let rig = [
+        format!("[arm]\ndriver = \"sim\"\nurdf = {:?}\nflange_link = \"panda_link8\"\n", urdf.display().to_string()),
+        camera("wrist", [0.064, 0.002, 0.046], wrong_rotation, [0.06, 0.0, 0.045], right_rotation),
+        camera("side", [-0.06, 0.04, 0.045], right_rotation, SIDE, wrong_rotation),
+    ];
+    std::fs::write(folder.join("rig.toml"), rig.concat()).expect("the disk has space");
+    let args = ["calibrate", "scene", "rig.toml", "--sim", "--seconds", "10", "--json", "--report", "scene.html"];
+    let output = fieldrig(folder, &args);
+    assert!(output.status.success(), "{}", stderr(&output));
+    let page = std::fs::read_to_string(folder.join("scene.html")).expect("a report");
+    for words in ["Poses between cameras", "wrist in side", "side in its parent"] {
+        assert!(page.contains(words), "{words} is missing");
+    }
+    let cameras = &json_of(&output)["cameras"];
+    assert!(cameras["side"]["relative"].is_null(), "{cameras}");
+    let relative = &cameras["wrist"]["relative"];
+    assert_eq!(relative["camera"], "side");
+    let [x, y, z, w] = wrong_rotation;
+    let side =
+        Transform::from_parts(Vector3::from(SIDE).into(), UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z)));
+    let found = numbers(&relative["camera_from_this"]).try_into().expect("16 numbers");
+    let error = (side.inverse() * true_pose()).inverse() * transform::from_rows(&found).expect("a rigid transform");
+    let (mm, degrees) = (1e3 * error.translation.vector.norm(), error.rotation.angle().to_degrees());
+    assert!(mm < 0.5 && degrees < 0.05, "{mm} mm, {degrees} degrees");
+    for holder in [relative, &cameras["side"], &cameras["wrist"]] {
+        for key in ["sigma_mm", "sigma_deg"] {
+            let sigmas = numbers(&holder[key]);
+            assert!(sigmas.len() == 3 && sigmas.iter().all(|sigma| *sigma > 0.0 && *sigma < 0.3), "{holder}");
+        }
+    }
+}
