@@ -136,6 +136,7 @@ fn unusable_scans_are_rejected_with_the_reason() {
 /// Two RGB-D cameras on the flange, both wrong by 3 degrees.
 #[test]
 fn scene_calibration_reports_the_pose_between_two_cameras() {
+    const MAX_MM: f64 = 0.5;
     const SIDE: [f64; 3] = [-0.064, 0.037, 0.045];
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
@@ -175,11 +176,18 @@ fn scene_calibration_reports_the_pose_between_two_cameras() {
     let found = numbers(&relative["camera_from_this"]).try_into().expect("16 numbers");
     let error = (side.inverse() * true_pose()).inverse() * transform::from_rows(&found).expect("a rigid transform");
     let (mm, degrees) = (1e3 * error.translation.vector.norm(), error.rotation.angle().to_degrees());
-    assert!(mm < 0.5 && degrees < 0.05, "{mm} mm, {degrees} degrees");
+    assert!(mm < MAX_MM && degrees < 0.05, "{mm} mm, {degrees} degrees");
+    let errors_mm = error.translation.vector * 1e3;
+    let errors_deg = error.rotation.scaled_axis().map(f64::to_degrees);
+    for (errors, key) in [(errors_mm, "sigma_mm"), (errors_deg, "sigma_deg")] {
+        for (axis, sigma) in numbers(&relative[key]).into_iter().enumerate() {
+            assert!(errors[axis].abs() < 3.0 * sigma, "{key}: axis {axis} is off by {}, stated {sigma}", errors[axis]);
+        }
+    }
     for holder in [relative, &cameras["side"], &cameras["wrist"]] {
         for key in ["sigma_mm", "sigma_deg"] {
             let sigmas = numbers(&holder[key]);
-            assert!(sigmas.len() == 3 && sigmas.iter().all(|sigma| *sigma > 0.0 && *sigma < 0.3), "{holder}");
+            assert!(sigmas.len() == 3 && sigmas.iter().all(|sigma| *sigma > 0.0 && *sigma < MAX_MM), "{holder}");
         }
     }
 }

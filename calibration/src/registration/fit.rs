@@ -5,7 +5,7 @@ use super::layout::Layout;
 use super::pairs::Pair;
 use super::prepared_image::PreparedImage;
 use super::solve::Solution;
-use super::sums::{self, Noise, PixelSubset, ResidualOptions};
+use super::sums::{self, Noise, PairSums, PixelSubset, ResidualOptions};
 use nalgebra::DVector;
 
 /// Maximum number of steps at each level, the finest first.
@@ -24,6 +24,45 @@ pub(super) struct Fit {
     pub(super) layout: Layout,
     pub(super) solution: Solution,
     pub(super) noise: Noise,
+}
+
+impl Fit {
+    /// Adds the discretization error to the covariance: the change of the estimate between the finest level and the next
+    /// one. All pairs share this error, so that their scatter does not contain it. At half the pixel size, an error of
+    /// first or higher order in the pixel size is at most as large as this change.
+    pub(super) fn add_discretization_error(&mut self, images: &[PreparedImage], pairs: &[Pair]) {
+        const LEVEL: usize = 1;
+        if images.iter().all(|image| image.levels.len() <= LEVEL) {
+            return;
+        }
+        let mut options = ResidualOptions {
+            level: LEVEL,
+            occlusion_frac: OCCLUSION_FRAC[LEVEL],
+            noise: self.noise,
+            part: PixelSubset::All,
+        };
+        let mut corrections = self.corrections.clone();
+        let mut change = DVector::zeros(self.layout.n());
+        for _ in 0..MAX_ITERATIONS[LEVEL] {
+            let sums = sums::of_pairs(images, &corrections.views(images, &self.layout), pairs, &options);
+            let Some(noise) = sums::noise_of(&sums) else { return };
+            options.noise = noise;
+            let solution = step(&self.layout, &corrections, pairs, &sums);
+            corrections.apply_step(&self.layout, &solution.step);
+            change += &solution.step;
+            if solution.step_in_sigmas() < CONVERGED_STEP_SIGMAS[0] {
+                break;
+            }
+        }
+        self.solution.add_error(&change);
+    }
+}
+
+fn step(layout: &Layout, corrections: &Corrections, pairs: &[Pair], sums: &[PairSums]) -> Solution {
+    let scales = layout.params.iter().map(|param| param.scale());
+    let values = layout.params.iter().map(|param| corrections.value(*param));
+    let [scales, values] = [scales.collect::<Vec<f64>>(), values.collect()].map(DVector::from);
+    Solution::new(scales, &values, pairs, sums)
 }
 
 /// Estimates the parameters of a layout, starting from given corrections; `None` if the pairs have no valid
@@ -47,10 +86,7 @@ pub(super) fn fit(images: &[PreparedImage], pairs: &[Pair], layout: Layout, star
         for _ in 0..MAX_ITERATIONS[level] {
             let sums = sums::of_pairs(images, &corrections.views(images, &layout), &subset, &options);
             options.noise = sums::noise_of(&sums)?;
-            let scales = layout.params.iter().map(|param| param.scale());
-            let values = layout.params.iter().map(|param| corrections.value(*param));
-            let [scales, values] = [scales.collect::<Vec<f64>>(), values.collect()].map(DVector::from);
-            let solution = Solution::new(scales, &values, &subset, &sums);
+            let solution = step(&layout, &corrections, &subset, &sums);
             corrections.apply_step(&layout, &solution.step);
             log::debug!(
                 "alignment: level {level}, {:?}, step of {:.2} sigma",

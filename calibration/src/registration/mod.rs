@@ -94,7 +94,7 @@ pub fn align(keyframes: &[Arc<Keyframe>], choice: &CameraRefinement) -> Option<A
     let uncorrected =
         CalibrationModel { set: ParamSet::empty(), fit: None, corrections: Corrections::none(scene.cameras.len()) };
     let (mut trials, mut unobservable) = (Vec::new(), Vec::new());
-    let kept = match choice {
+    let mut kept = match choice {
         CameraRefinement::Always(set) => {
             let variant = scene.model(*set, &uncorrected)?;
             trials.push(scene.evaluate(*set, &uncorrected, &variant));
@@ -108,7 +108,8 @@ pub fn align(keyframes: &[Arc<Keyframe>], choice: &CameraRefinement) -> Option<A
             scene.select_params(&all, uncorrected, &mut trials, &mut unobservable)
         }
     };
-    if let Some(fit) = &kept.fit {
+    if let Some(fit) = &mut kept.fit {
+        fit.add_discretization_error(&scene.images, &scene.pairs);
         unobservable.extend(report::unobservable(&scene, fit));
     }
     let kept = if kept.set.contains(ParamSet::IMAGE_POSES) { scene.with_validation_poses(kept) } else { kept };

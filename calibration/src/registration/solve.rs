@@ -90,6 +90,12 @@ impl Solution {
         &inverse * meat * &inverse * (n_active / (n_active - 1.0).max(1.0))
     }
 
+    /// Adds an error of the parameters that the scatter of the pairs does not contain to the covariance.
+    pub(super) fn add_error(&mut self, error: &DVector<f64>) {
+        let scaled = error.component_div(&self.scales);
+        self.covariance.ger(1.0, &scaled, &scaled, 1.0);
+    }
+
     /// Inverse of the information matrix over the observable directions, in scaled units.
     fn inverse(&self) -> DMatrix<f64> {
         let n = self.scales.len();

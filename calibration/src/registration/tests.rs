@@ -156,6 +156,34 @@ fn reported_sigmas_match_actual_errors() {
     assert!((0.25..4.0).contains(&mean), "{mean} of {squares:.1?}");
 }
 
+/// Of the reported uncertainty, which contains the error that all pairs have in common.
+#[test]
+fn truth_is_within_the_stated_extrinsics() {
+    const MAX_SIGMAS: f64 = 3.0;
+    let (mut error_norms, mut sigma_norms) = (0.0, 0.0);
+    for seed in 0..4 {
+        for noise in [0.1, 1.0] {
+            let miscalibration =
+                Miscalibration { extrinsics: wrong_extrinsics(), seed, noise, ..Miscalibration::none() };
+            let alignment = align_given(&miscalibration, ParamSet::EXTRINSICS);
+            let correction = &alignment.corrections["wrist"];
+            let corrected =
+                crate::rigid_transform(correction.rotation_rad.into(), correction.translation_m.into()).inverse();
+            let error = transform::log(&(miscalibration.extrinsics * corrected), 1.0);
+            let covariance = alignment.extrinsics_covariance.as_ref().expect("extrinsics were estimated");
+            let sigmas = covariance.of_camera("wrist").expect("extrinsics were estimated");
+            for axis in 0..3 {
+                let (m, rad) = (error.linear_m_s[axis].abs(), error.angular_rad_s[axis].abs());
+                assert!(m < MAX_SIGMAS * sigmas.m[axis], "{m} m of {sigmas:?}");
+                assert!(rad < MAX_SIGMAS * sigmas.rad[axis], "{rad} rad of {sigmas:?}");
+            }
+            error_norms += error.linear_m_s.norm();
+            sigma_norms += Vector3::from(sigmas.m).norm();
+        }
+    }
+    assert!(sigma_norms < 10.0 * error_norms, "stated {sigma_norms}, measured {error_norms}");
+}
+
 #[test]
 fn result_does_not_depend_on_thread_count() {
     let keyframes = capture(&Miscalibration { extrinsics: wrong_extrinsics(), ..Miscalibration::none() });
