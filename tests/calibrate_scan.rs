@@ -163,7 +163,7 @@ fn scene_calibration_reports_the_pose_between_two_cameras() {
     let output = fieldrig(folder, &args);
     assert!(output.status.success(), "{}", stderr(&output));
     let page = std::fs::read_to_string(folder.join("scene.html")).expect("a report");
-    for words in ["Poses between cameras", "wrist in side", "side in its parent"] {
+    for words in ["Relative camera poses", "wrist in side", "side in its parent"] {
         assert!(page.contains(words), "{words} is missing");
     }
     let cameras = &json_of(&output)["cameras"];

@@ -47,7 +47,7 @@ pub struct ArmDuringImage {
 }
 
 impl ArmDuringImage {
-    /// Pose of the flange when a row is exposed, 0 to 1 from the first to the last.
+    /// Flange pose at the exposure of a row; `row_frac` is 0 for the first row and 1 for the last.
     pub fn base_from_flange_at(&self, row_frac: f64) -> Transform {
         let [first, last] = &self.base_from_flange_at_rows;
         transform::interpolate(first, last, row_frac)
@@ -71,8 +71,8 @@ pub struct CalibrationImages {
 
 /// Reads the images of a camera until `is_end` returns true or the samples end.
 ///
-/// * `max_shift_px`: images of a scene at `join.default_depth_m` that move further during the exposure of all rows are
-///   not kept.
+/// * `max_shift_px`: maximum predicted image motion over readout, exposure and stamp uncertainty, for a scene at
+///   `join.default_depth_m`. Images with more motion are not kept.
 /// * `on_image`: is called after each image, with the number of images kept.
 ///
 /// # Errors
@@ -220,7 +220,7 @@ impl<'a> Reader<'a> {
         !self.found.images.iter().filter_map(|image| image.arm.as_ref()).any(is_near)
     }
 
-    /// Predicted motion of the image from the first to the last exposed instant, and within the error of the stamp.
+    /// Maximum predicted image motion over readout, exposure and stamp uncertainty, pixels.
     fn shift_px(&self, image: &Image, arm: &ArmDuringImage) -> f64 {
         let [first, last] = &arm.base_from_flange_at_rows;
         let readout_secs = self.readout_secs();

@@ -50,7 +50,7 @@ pub enum Error {
         camera: String,
     },
     /// The specification of a printed target is invalid.
-    #[error("target {target:?}: {source}")]
+    #[error("sim.target.{target}.spec: {source}; correct this key in the rig file")]
     Target {
         /// Name of the target in the rig file.
         target: String,
@@ -58,7 +58,9 @@ pub enum Error {
         source: targets::SpecError,
     },
     /// A printed target cannot be drawn.
-    #[error("target {target:?} cannot be drawn: {source}")]
+    #[error(
+        "sim.target.{target}.spec: the target cannot be drawn: {source}; change the number or size of its squares or tags"
+    )]
     DrawTarget {
         /// Name of the target in the rig file.
         target: String,

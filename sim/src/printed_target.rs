@@ -8,9 +8,9 @@ use image::{ExtendedColorType, ImageEncoder};
 use nalgebra::{Point3, Vector3};
 use targets::Raster;
 
-/// Side of the texture, pixels. With a power of two, no level of detail is shifted.
+/// Side of the square texture, pixels. A power of two, so that no mipmap level is shifted.
 const SIDE_PX: u32 = 2048;
-/// Thickness of the plate, and its distance behind the print, which avoids z-fighting, meters.
+/// Thickness of the plate, and gap between print and plate to avoid z-fighting, meters.
 const PLATE_M: f64 = 0.003;
 const GAP_M: f64 = 1e-4;
 /// Gray values of ink and paper. White would be overexposed where the light is bright.
@@ -28,7 +28,7 @@ pub(crate) struct Printed {
 pub(crate) fn print(config: &TargetConfig) -> Result<Printed, Error> {
     let target = config.target()?;
     let failed = |source| Error::DrawTarget { target: config.name.clone(), source };
-    // The size in meters, from a coarse picture with whole millimeters.
+    // First rasterize at 1 px per mm to get the size.
     let coarse = target.raster(1000.0).map_err(failed)?;
     let longest_px = coarse.size_px.into_iter().max().unwrap_or(1);
     let picture = target.raster(1000.0 * f64::from(SIDE_PX - 1) / f64::from(longest_px)).map_err(failed)?;

@@ -1,4 +1,4 @@
-//! How often the stated uncertainty contains the truth.
+//! How often the confidence ellipsoid of the reported uncertainty contains the truth.
 
 use super::method::squared_error;
 use super::scene::{self, Noise, Scene, brown_conrady, camera_from_board, intrinsics, view};
@@ -65,8 +65,8 @@ fn p95(mut values: Vec<f64>) -> f64 {
 
 /// Measures all kinds with `n_runs` seeds each.
 pub(super) fn measure(n_runs: u64) -> Vec<Coverage> {
-    let exact = Noise { corner_px: CORNER_PX, robot_rad: 0.0, robot_m: 0.0 };
-    let inexact = Noise { robot_rad: 3e-4, robot_m: 3e-4, ..exact };
+    let no_robot_noise = Noise { corner_px: CORNER_PX, robot_rad: 0.0, robot_m: 0.0 };
+    let robot_noise = Noise { robot_rad: 3e-4, robot_m: 3e-4, ..no_robot_noise };
     let hand_eye = |name, noise: Noise, has_poses: bool, options: HandEyeOptions| {
         let runs = (0..n_runs).into_par_iter().map(|seed| hand_eye_run(seed, noise, has_poses, options));
         Coverage::of(name, ["mm", "degrees"], runs.collect())
@@ -78,10 +78,10 @@ pub(super) fn measure(n_runs: u64) -> Vec<Coverage> {
     let default = HandEyeOptions::default();
     let with_lens = HandEyeOptions { estimate_intrinsics: true, ..default };
     vec![
-        hand_eye("hand-eye, exact robot", exact, false, default),
-        hand_eye("hand-eye, robot with 0.3 mm and 0.3 mrad", inexact, false, default),
-        hand_eye("hand-eye with lens, exact robot", exact, false, with_lens),
-        hand_eye("hand-eye from board poses, robot with 0.3 mm and 0.3 mrad", inexact, true, default),
+        hand_eye("hand-eye, no robot pose noise", no_robot_noise, false, default),
+        hand_eye("hand-eye, robot pose noise of 0.3 mm and 0.3 mrad", robot_noise, false, default),
+        hand_eye("hand-eye with lens, no robot pose noise", no_robot_noise, false, with_lens),
+        hand_eye("hand-eye from board poses, robot pose noise of 0.3 mm and 0.3 mrad", robot_noise, true, default),
         lens("lens, pinhole", Lens::Pinhole, LensModel::Pinhole),
         lens("lens, Brown-Conrady", brown_conrady(), LensModel::BrownConrady5),
         lens("lens, Kannala-Brandt", Lens::KannalaBrandt([0.03, -0.01, 0.002, 0.0]), LensModel::KannalaBrandt),
@@ -165,7 +165,7 @@ mod tests {
     }
 
     #[test]
-    fn stated_uncertainty_covers_the_truth() {
+    fn reported_uncertainty_covers_the_truth() {
         for coverage in measure(12) {
             assert!(coverage.covered_frac > 0.7 && coverage.n_refused == 0, "{coverage:?}");
         }

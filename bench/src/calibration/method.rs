@@ -11,14 +11,14 @@ use serde::Serialize;
 /// A method of hand-eye calibration.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Method {
-    /// A closed form of the board poses.
+    /// A closed-form solver on board poses.
     ClosedForm(ClosedForm),
     /// [`calibrate_hand_eye`] with board poses.
     Refined,
     /// [`calibrate_hand_eye`] with corners.
-    Joint,
+    BundleAdjustment,
     /// [`calibrate_hand_eye`] with corners and unknown intrinsics.
-    JointWithLens,
+    BundleAdjustmentWithLens,
 }
 
 impl Method {
@@ -27,8 +27,8 @@ impl Method {
         Self::ClosedForm(ClosedForm::Daniilidis),
         Self::ClosedForm(ClosedForm::TsaiLenz),
         Self::Refined,
-        Self::Joint,
-        Self::JointWithLens,
+        Self::BundleAdjustment,
+        Self::BundleAdjustmentWithLens,
     ];
 
     pub(super) fn name(self) -> &'static str {
@@ -37,14 +37,15 @@ impl Method {
             Self::ClosedForm(ClosedForm::Daniilidis) => "Daniilidis",
             Self::ClosedForm(ClosedForm::TsaiLenz) => "Tsai-Lenz",
             Self::Refined => "refined (board poses)",
-            Self::Joint => "joint (corners)",
-            Self::JointWithLens => "joint with lens",
+            Self::BundleAdjustment => "bundle adjustment (corners)",
+            Self::BundleAdjustmentWithLens => "bundle adjustment with lens",
         }
     }
 
     /// Calibrates from corners.
     pub(super) fn calibrate(self, samples: &[HandEyeSample], truth: &Transform) -> Outcome {
-        let options = HandEyeOptions { estimate_intrinsics: self == Self::JointWithLens, ..HandEyeOptions::default() };
+        let options =
+            HandEyeOptions { estimate_intrinsics: self == Self::BundleAdjustmentWithLens, ..HandEyeOptions::default() };
         let found = match self {
             Self::ClosedForm(solver) => {
                 let pairs: Vec<_> = with_board_poses(samples).iter().filter_map(pair).collect();
@@ -52,7 +53,9 @@ impl Method {
                 return found.map_or(Outcome::Refused, |found| Outcome::Solved(Errors::of(&found, truth, None)));
             }
             Self::Refined => calibrate_hand_eye(&input(with_board_poses(samples), options)),
-            Self::Joint | Self::JointWithLens => calibrate_hand_eye(&input(samples.to_vec(), options)),
+            Self::BundleAdjustment | Self::BundleAdjustmentWithLens => {
+                calibrate_hand_eye(&input(samples.to_vec(), options))
+            }
         };
         match found {
             Ok(found) => {
@@ -91,7 +94,7 @@ pub(super) enum Outcome {
 pub(super) struct Errors {
     pub(super) mm: f64,
     pub(super) deg: f64,
-    /// Squared Mahalanobis distance, if the method states an uncertainty.
+    /// Squared Mahalanobis distance, if the method reports an uncertainty.
     pub(super) squared: Option<f64>,
 }
 
@@ -101,8 +104,8 @@ impl Errors {
         Self { mm: 1e3 * error.translation.vector.norm(), deg: error.rotation.angle().to_degrees(), squared }
     }
 
-    /// Whether the result is unusable: wrong by more than 5 mm or 0.5 degrees, or not finite.
-    pub(super) fn is_broken(&self) -> bool {
+    /// Whether the result failed: error above 5 mm or 0.5 degrees, or not finite.
+    pub(super) fn has_failed(&self) -> bool {
         const MAX_MM: f64 = 5.0;
         const MAX_DEG: f64 = 0.5;
         !(self.mm <= MAX_MM && self.deg <= MAX_DEG)

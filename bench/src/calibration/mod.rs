@@ -1,12 +1,12 @@
-//! Accuracy, stated uncertainty, speed and limits of calibration, on simulated measurements with a known truth.
+//! Accuracy, reported uncertainty, speed and limits of calibration, on simulated measurements with a known truth.
 //!
 //! Corners of a chessboard are computed with normal errors, without rendering. Calibration without a target
 //! ([`CalibrationOptions::rig`]) needs the simulator.
 
+mod arm_configurations;
 mod coverage;
 mod method;
 mod pages;
-mod postures;
 mod rigs;
 mod scene;
 mod speed;
@@ -14,8 +14,8 @@ mod stability;
 
 use crate::Result;
 use crate::findings::BenchResult;
+use arm_configurations::ArmConfiguration;
 use coverage::Coverage;
-use postures::Posture;
 use rigs::RigResult;
 use serde::Serialize;
 use session::Context;
@@ -26,7 +26,7 @@ use std::path::PathBuf;
 /// Options of [`run`].
 #[derive(Clone, Debug)]
 pub struct CalibrationOptions {
-    /// Calibrations per kind, for the coverage of the stated uncertainty.
+    /// Calibrations per kind, for the coverage of the reported uncertainty.
     pub runs: u64,
     /// Scenes per number of poses or combination of conditions.
     pub seeds: u64,
@@ -46,7 +46,7 @@ struct Results {
     coverage: Vec<Coverage>,
     speed: Vec<Speed>,
     stability: Vec<Cell>,
-    postures: Vec<Posture>,
+    arm_configurations: Vec<ArmConfiguration>,
     rigs: Vec<RigResult>,
 }
 
@@ -64,9 +64,9 @@ pub fn run(options: &CalibrationOptions) -> Result<BenchResult> {
     let coverage = coverage::measure(options.runs);
     log::info!("stability");
     let stability = stability::measure(options.seeds);
-    log::info!("postures");
-    let postures = postures::measure(options.seeds);
-    let mut results = Results { coverage, speed, stability, postures, rigs: Vec::new() };
+    log::info!("arm configurations");
+    let arm_configurations = arm_configurations::measure(options.seeds);
+    let mut results = Results { coverage, speed, stability, arm_configurations, rigs: Vec::new() };
     for seed in 1..=options.rig.as_ref().map_or(0, |_| options.rigs) {
         let Some(rig) = &options.rig else { break };
         results.rigs.push(rigs::measure(rig, seed, options.scan_secs)?);

@@ -3,7 +3,7 @@
 use super::coverage::Coverage;
 use super::method::Method;
 use super::speed::Speed;
-use super::stability::{Cell, Mistake, methods};
+use super::stability::{Cell, OutlierType, methods};
 use super::{CalibrationOptions, Results};
 use crate::findings::Findings;
 use session::Table;
@@ -22,7 +22,11 @@ pub(super) fn findings(options: &CalibrationOptions, results: &Results) -> Findi
         charts.push(("-rigs", rigs_chart(results)));
     }
     let mut tables = vec![coverage_table(&results.coverage), speed_table(&results.speed)];
-    tables.extend([limits_table(&results.stability), totals_table(&results.stability), postures_table(results)]);
+    tables.extend([
+        limits_table(&results.stability),
+        totals_table(&results.stability),
+        arm_configurations_table(results),
+    ]);
     if !results.rigs.is_empty() {
         tables.push(rigs_table(results));
     }
@@ -34,7 +38,7 @@ pub(super) fn findings(options: &CalibrationOptions, results: &Results) -> Findi
                 "Simulated corners of a chessboard of 9 x 6 inner corners at 0.5 m, camera of 1280 x 720 pixels. Coverage: {} calibrations with 15 views and 0.1 px of noise per line. Other results: medians of {} scenes.",
                 options.runs, options.seeds
             ),
-            "A result is broken if it is wrong by more than 5 mm or 0.5 degrees. Closed forms use board poses from the corners, like \"refined\".".into(),
+            "A result has failed if its error is above 5 mm or 0.5 degrees. Closed-form solvers use board poses from the corners, like \"refined\".".into(),
             format!("fieldrig {}.", env!("CARGO_PKG_VERSION")),
         ],
         charts,
@@ -73,8 +77,8 @@ fn coverage_chart(results: &[Coverage]) -> Chart {
     };
     let ideal = Line { label: "ideal".into(), points: LEVELS.map(|level| point(level, level)).into(), is_peer: true };
     Chart {
-        title: "Coverage of the stated uncertainty".into(),
-        subtitle: "results whose ellipsoid of a confidence level contains the truth".into(),
+        title: "Coverage of the reported uncertainty".into(),
+        subtitle: "fraction of results whose confidence ellipsoid contains the truth".into(),
         x: axis("confidence level, %", Scale::Linear, LEVELS.into()),
         y: axis("results that contain the truth, %", Scale::Linear, Vec::new()),
         lines: results.iter().map(line).chain([ideal]).collect(),
@@ -166,37 +170,37 @@ fn sweeps() -> [Sweep; 4] {
             suffix: "-rotation",
             label: "rotation of the flange, degrees (standard deviation per axis)",
             value: |cell| cell.condition.spread_deg,
-            is_in: |cell| has_base_poses(cell) && cell.condition.wrong_percent == 0,
+            is_in: |cell| has_base_poses(cell) && cell.condition.outlier_percent == 0,
         },
         Sweep {
             suffix: "-poses",
             label: "poses",
             value: |cell| cell.condition.n_poses as f64,
-            is_in: |cell| has_base_spread(cell) && cell.condition.wrong_percent == 0,
+            is_in: |cell| has_base_spread(cell) && cell.condition.outlier_percent == 0,
         },
         Sweep {
-            suffix: "-wrong-corners",
-            label: "wrong corners, %",
-            value: |cell| f64::from(cell.condition.wrong_percent),
+            suffix: "-outlier-corners",
+            label: "outlier corners, %",
+            value: |cell| f64::from(cell.condition.outlier_percent),
             is_in: |cell| {
-                has_base_spread(cell) && has_base_poses(cell) && cell.condition.mistake == Mistake::WrongCorners
+                has_base_spread(cell) && has_base_poses(cell) && cell.condition.outlier_type == OutlierType::Corners
             },
         },
         Sweep {
-            suffix: "-wrong-images",
-            label: "images with a wrong robot pose, %",
-            value: |cell| f64::from(cell.condition.wrong_percent),
+            suffix: "-outlier-poses",
+            label: "outlier robot poses, %",
+            value: |cell| f64::from(cell.condition.outlier_percent),
             is_in: |cell| {
-                let is_right = cell.condition.wrong_percent == 0;
-                let is_image = cell.condition.mistake == Mistake::WrongImages;
-                has_base_spread(cell) && has_base_poses(cell) && (is_right || is_image)
+                let has_none = cell.condition.outlier_percent == 0;
+                let are_poses = cell.condition.outlier_type == OutlierType::RobotPoses;
+                has_base_spread(cell) && has_base_poses(cell) && (has_none || are_poses)
             },
         },
     ]
 }
 
 fn stability_charts(cells: &[Cell]) -> impl Iterator<Item = (&'static str, Chart)> {
-    const BROKEN_MM: f64 = 5.0;
+    const FAILED_MM: f64 = 5.0;
     sweeps().into_iter().map(move |sweep| {
         let own: Vec<&Cell> = cells.iter().filter(|cell| (sweep.is_in)(cell)).collect();
         let mut levels: Vec<f64> = own.iter().map(|cell| (sweep.value)(cell)).collect();
@@ -210,30 +214,30 @@ fn stability_charts(cells: &[Cell]) -> impl Iterator<Item = (&'static str, Chart
         let chart = Chart {
             title: format!("Hand-eye calibration: {}", sweep.label),
             subtitle: format!(
-                "median error of the results; a missing point: all refused. Otherwise {BASE_POSES} poses, {BASE_SPREAD_DEG} degrees"
+                "median error of the results; no point: all runs refused. Otherwise {BASE_POSES} poses, {BASE_SPREAD_DEG} degrees"
             ),
             x: axis(sweep.label, Scale::Levels(levels), Vec::new()),
             y: axis("position error, mm", Scale::Log, Vec::new()),
             lines: methods().map(line).collect(),
-            thresholds: vec![(BROKEN_MM, "broken: 5 mm".into())],
+            thresholds: vec![(FAILED_MM, "failed: above 5 mm".into())],
             markers: Vec::new(),
         };
         (sweep.suffix, chart)
     })
 }
 
-/// For each sweep and method: refused and broken results at each level.
+/// For each sweep and method: refused and failed results at each level.
 fn limits_table(cells: &[Cell]) -> Table {
     let mut rows = Vec::new();
     for sweep in sweeps() {
         for method in methods() {
             let own = cells.iter().filter(|cell| (sweep.is_in)(cell) && cell.method == method.name());
             let level = |cell: &Cell| {
-                let rest = match (cell.n_refused, cell.n_broken) {
+                let rest = match (cell.n_refused, cell.n_failed) {
                     (0, 0) => "ok".to_owned(),
                     (refused, 0) => format!("{refused} refused"),
-                    (0, broken) => format!("{broken} broken"),
-                    (refused, broken) => format!("{refused} refused, {broken} broken"),
+                    (0, failed) => format!("{failed} failed"),
+                    (refused, failed) => format!("{refused} refused, {failed} failed"),
                 };
                 format!("{}: {rest}", (sweep.value)(cell))
             };
@@ -243,8 +247,8 @@ fn limits_table(cells: &[Cell]) -> Table {
     }
     let n_runs = cells.first().map_or(0, |cell| cell.n_runs);
     Table {
-        title: format!("Limits: of {n_runs} scenes per level"),
-        head: words(["varied, method", "level: results"]),
+        title: format!("Failures out of {n_runs} scenes per level"),
+        head: words(["condition and method", "results per level"]),
         rows,
     }
 }
@@ -255,48 +259,63 @@ fn totals_table(cells: &[Cell]) -> Table {
             cells.iter().filter(|cell| cell.method == method.name()).map(value).sum()
         };
         let n_runs = sum(|cell| cell.n_runs);
-        let [refused, broken, misleading] =
-            [sum(|cell| cell.n_refused), sum(|cell| cell.n_broken), sum(|cell| cell.n_misleading)];
+        let [refused, failed, outside_region] =
+            [sum(|cell| cell.n_refused), sum(|cell| cell.n_failed), sum(|cell| cell.n_failed_outside_region)];
         let has_uncertainty = !matches!(method, Method::ClosedForm(_));
-        let misleading = if has_uncertainty { misleading.to_string() } else { "not stated".into() };
+        let outside_region = if has_uncertainty { outside_region.to_string() } else { "not reported".into() };
         vec![
             method.name().to_owned(),
             n_runs.to_string(),
-            (n_runs - refused - broken).to_string(),
+            (n_runs - refused - failed).to_string(),
             refused.to_string(),
-            broken.to_string(),
-            misleading,
+            failed.to_string(),
+            outside_region,
         ]
     };
     Table {
-        title: "All combinations of rotation, poses and mistakes".into(),
-        head: words(["method", "runs", "usable", "refused", "broken", "broken beyond the stated uncertainty"]),
+        title: "All combinations of rotation, poses and outliers".into(),
+        head: words([
+            "method",
+            "runs",
+            "usable",
+            "refused",
+            "failed",
+            "failed and outside the 99.99 % confidence region",
+        ]),
         rows: methods().map(row).collect(),
     }
 }
 
-fn postures_table(results: &Results) -> Table {
+fn arm_configurations_table(results: &Results) -> Table {
     let percent = |frac: Option<f64>| frac.map_or("-".to_owned(), |frac| format!("{:.0} %", 100.0 * frac));
     let number = |value: Option<f64>, digits: usize| value.map_or("-".to_owned(), |value| format!("{value:.digits$}"));
-    let row = |posture: &super::Posture| {
+    let row = |configuration: &super::ArmConfiguration| {
         vec![
             format!(
                 "{} degrees, {}",
-                posture.angle_deg,
-                if posture.estimates_joints { "offsets estimated" } else { "offsets ignored" }
+                configuration.angle_deg,
+                if configuration.estimates_joints { "offsets estimated" } else { "offsets ignored" }
             ),
-            number(posture.mm, 2),
-            number(posture.deg, 3),
-            format!("{} of {}", posture.n_refused, posture.n_runs),
-            posture.n_broken.to_string(),
-            percent(posture.observable_frac),
-            percent(posture.within_3_sigma_frac),
+            number(configuration.mm, 2),
+            number(configuration.deg, 3),
+            format!("{} of {}", configuration.n_refused, configuration.n_runs),
+            configuration.n_failed.to_string(),
+            percent(configuration.observable_frac),
+            percent(configuration.within_3_sigma_frac),
         ]
     };
     Table {
         title: "Distance of joint 6 from the wrist singularity, with joint offsets of 4 mrad".into(),
-        head: words(["posture", "mm", "degrees", "refused", "broken", "offsets observable", "within 3 sigma"]),
-        rows: results.postures.iter().map(row).collect(),
+        head: words([
+            "arm configuration",
+            "mm",
+            "degrees",
+            "refused",
+            "failed",
+            "offsets observable",
+            "within 3 sigma",
+        ]),
+        rows: results.arm_configurations.iter().map(row).collect(),
     }
 }
 
@@ -313,7 +332,7 @@ fn rigs_chart(results: &Results) -> Chart {
         y: axis("mm", Scale::Log, Vec::new()),
         lines: vec![
             line("error", &|rig| rig.errors.map(|errors| errors.mm)),
-            line("stated standard deviation", &|rig| rig.sigma_mm),
+            line("reported standard deviation", &|rig| rig.sigma_mm),
         ],
         thresholds: vec![(GOAL_MM, "goal: 0.2 mm".into())],
         markers: Vec::new(),

@@ -23,7 +23,7 @@ pub(super) struct RigResult {
     pub(super) n_images: usize,
     /// Errors after the calibration; `None` if it was refused.
     pub(super) errors: Option<Errors>,
-    /// Lengths of the stated standard deviations.
+    /// Euclidean norms of the reported per-axis standard deviations.
     pub(super) sigma_mm: Option<f64>,
     pub(super) sigma_deg: Option<f64>,
     /// Time of the estimation, without the scan, seconds.
@@ -60,11 +60,11 @@ pub(super) fn measure(rig_file: &Path, seed: u64, scan_secs: f64) -> Result<RigR
     let corrected = found.rig.as_ref().filter(|_| !found.refused.contains_key(&name));
     let Some(corrected) = corrected else { return Ok(RigResult::refused(seed, data.keyframes.len(), started)) };
     let sigmas = found.alignment.extrinsics_covariance.as_ref().and_then(|covariance| covariance.of_camera(&name));
-    let length = |sigmas: [f64; 3]| Vector3::from(sigmas).norm();
+    let norm = |sigmas: [f64; 3]| Vector3::from(sigmas).norm();
     Ok(RigResult {
         errors: Some(Errors::of(&corrected.cameras[0].parent_from_camera, &truth, None)),
-        sigma_mm: sigmas.map(|sigmas| 1e3 * length(sigmas.m)),
-        sigma_deg: sigmas.map(|sigmas| length(sigmas.rad).to_degrees()),
+        sigma_mm: sigmas.map(|sigmas| 1e3 * norm(sigmas.m)),
+        sigma_deg: sigmas.map(|sigmas| norm(sigmas.rad).to_degrees()),
         ..RigResult::refused(seed, data.keyframes.len(), started)
     })
 }

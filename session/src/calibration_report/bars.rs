@@ -9,7 +9,7 @@ pub(super) type Column = (&'static str, usize);
 /// A row of a table with bars.
 pub(super) struct BarRow {
     pub(super) name: String,
-    /// What is special about it, such as `outlier`; empty otherwise.
+    /// Tag of the row, such as `outlier`; may be empty.
     pub(super) tag: String,
     /// One value per column.
     pub(super) values: Vec<Option<f64>>,

@@ -39,7 +39,7 @@ impl HandEyeReport<'_> {
         let n_samples = self.samples.len() + self.unused.len();
         let verdict = self.calibration.map_or(String::new(), |calibration| {
             let used = calibration.samples.iter().filter(|sample| sample.status == SampleStatus::Used);
-            format!("{} of {n_samples} samples agree.", used.count())
+            format!("{} of {n_samples} samples are inliers.", used.count())
         });
         let figures = match self.calibration {
             Some(calibration) => figures(calibration),
@@ -52,27 +52,26 @@ impl HandEyeReport<'_> {
         }
         page.section(
             "Rotations of the flange",
-            "RMS rotation about three orthogonal axes. The second axis limits the accuracy: turn the flange by 20 degrees or more about different axes.",
+            "RMS rotation about three orthogonal axes. The second-largest rotation limits the accuracy: turn the flange by 20 degrees or more about different axes.",
             &self.excitation(),
         );
         let next = self.next_poses.iter().map(|next| {
             let percent = format!("{:.0} %", 100.0 * (1.0 - next.sigma_frac));
             vec![next.motion.clone(), percent]
         });
-        page.table("Next poses to add", &["motion", "lower standard deviation by"], next.collect());
+        page.table("Next poses to add", &["motion", "reduction of the standard deviation"], next.collect());
         if let Some(calibration) = self.calibration {
-            let legend = "Position of the board according to each sample, relative to the result. A cloud along a line, or two clouds, point to a mistake.";
+            let legend = "Position of the board according to each sample, relative to the result. An elongated cloud or two clusters indicate a systematic error.";
             page.section("Scatter of the board", legend, &page::gallery(&scatter_plots(calibration)));
             page.section("Held-out samples", "", &page::note(Some(&held_out(calibration))));
-            let legend = "Difference between the measured board and the board that the result predicts. Bars are relative to the largest error of a used sample.";
+            let legend = "Difference between the measured and predicted board pose. Bars are relative to the largest error of a used sample.";
             let columns = [("position, mm", 2), ("rotation, °", 3), ("corners, px", 3)];
             let rows: Vec<BarRow> = calibration.samples.iter().map(row).collect();
             page.section("Samples", legend, &bars::table("sample", &columns, &rows));
         }
         let reasons = self.unused.iter().map(|unused| vec![unused.name.clone(), unused.reason.clone()]);
         page.table("Not used", &["sample", "reason"], reasons.collect());
-        let legend =
-            "Circles: detected corners. Crosses: where the result expects them, with the robot pose taken as exact.";
+        let legend = "Circles: detected corners. Crosses: corners predicted by the result, assuming exact robot poses.";
         page.section("Images", legend, &page::gallery(&self.pictures()));
         page.finish()
     }

@@ -50,7 +50,7 @@ impl IntrinsicsReport<'_> {
         }
         let next = self.calibration.and_then(|calibration| calibration.next_view.as_ref());
         page.section("Next image to take", "", &page::note(next.map(describe).as_deref()));
-        page.section("Over the image", "", &page::gallery(&self.maps(next)));
+        page.section("Image coverage, uncertainty and residuals", "", &page::gallery(&self.maps(next)));
         if let Some(calibration) = self.calibration {
             page.table("Selection of the lens model", &TRIAL_HEAD, calibration.trials.iter().map(trial).collect());
         }
@@ -58,7 +58,7 @@ impl IntrinsicsReport<'_> {
         let columns = [("error, px", 3), ("corners", 0)];
         page.section("Images", legend, &bars::table("image", &columns, &self.rows()));
         page.table("Not used", &["image", "reason"], self.reasons());
-        let legend = "Circles: detected corners. Crosses: where the result expects them.";
+        let legend = "Circles: detected corners. Crosses: corners predicted by the result.";
         page.section("Worst and median image", legend, &page::gallery(&self.pictures()));
         page.finish()
     }
@@ -99,14 +99,14 @@ impl IntrinsicsReport<'_> {
         map.grid(&calibration.uncertainty_px, Shade::Bad, 2);
         let [low, high] = range(&calibration.uncertainty_px);
         let caption = format!(
-            "Projection uncertainty: standard deviation of the image of a distant point, {low:.2} px (light) to {high:.2} px (dark)."
+            "Projection uncertainty: standard deviation of the projection of a distant point, {low:.2} px (light) to {high:.2} px (dark)."
         );
         maps.push(page::figure(&caption, &map.svg("projection uncertainty")));
         let mut map = ImageMap::new(self.size_px);
         let points: Vec<PointFit> = corners(calibration).copied().collect();
         let magnification = map.arrows(&points);
         let caption = format!(
-            "Residuals: detected minus projected corners, magnified {magnification:.0} times. Arrows of neighbors that point the same way are an error of the lens model or the target."
+            "Residuals: detected minus projected corners, magnified {magnification:.0} times. If neighboring arrows point the same way, the lens model does not fit or the target is not flat."
         );
         maps.push(page::figure(&caption, &map.svg("residuals of all corners")));
         maps

@@ -20,7 +20,7 @@ pub use time_offset::TimeOffsetReport;
 use crate::{Error, run_folder};
 use std::path::Path;
 
-/// What all reports begin with.
+/// Heading of every report.
 #[derive(Clone, Debug)]
 pub struct Heading {
     /// The input: a folder or file.

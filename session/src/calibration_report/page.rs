@@ -1,4 +1,4 @@
-//! Frame of a page: title, verdict, key figures, sections.
+//! Page layout: title, verdict, key figures, sections.
 
 use super::Heading;
 use crate::chart::drawing::escaped;

@@ -60,7 +60,7 @@ pub(super) fn svg(axes: [&str; 2], points: &[ScatterPoint]) -> String {
     )
 }
 
-/// Half of the range: a round number such that two steps contain a value.
+/// Tick step: the smallest round number of which two steps cover `largest`.
 fn tick_step(largest: f64) -> f64 {
     let half = largest / 2.0;
     let power = 10f64.powf(half.log10().floor());

@@ -36,9 +36,10 @@ impl SceneReport<'_> {
             if !gains_db.is_empty() {
                 figures.push(("gain on validation images", format!("{:+.2}", gains_db.iter().sum::<f64>()), "dB"));
             }
-            verdict = match alignment.estimates.is_empty() {
-                true => "Nothing to correct: no parameter improves the prediction of validation images.".to_owned(),
-                false => format!("{} corrections were accepted.", alignment.estimates.len()),
+            verdict = match alignment.estimates.len() {
+                0 => "Nothing to correct: no parameter improves the prediction of validation images.".to_owned(),
+                1 => "1 correction was accepted.".to_owned(),
+                n => format!("{n} corrections were accepted."),
             };
         }
         let mut page = Page::new("Calibration from a static scene", self.heading, &verdict, &figures);
@@ -52,10 +53,10 @@ impl SceneReport<'_> {
         page.table("Cameras", &["camera", "images", "accepted gain, dB", "extrinsics"], self.cameras());
         if let Some(calibration) = self.calibration {
             let unobservable = calibration.alignment.unobservable.iter().map(|direction| vec![direction.to_string()]);
-            page.table("Directions that the motion does not determine", &["combination"], unobservable.collect());
+            page.table("Unobservable directions", &["combination"], unobservable.collect());
             page.table("Poses of the cameras", &POSE_HEAD, self.poses(calibration));
             page.table("Standard deviations of the poses", &SIGMA_HEAD, self.sigmas(calibration));
-            page.table("Poses between cameras", &POSE_HEAD, self.relative_poses(calibration));
+            page.table("Relative camera poses", &POSE_HEAD, self.relative_poses(calibration));
         }
         page.finish()
     }
@@ -133,7 +134,7 @@ impl SceneReport<'_> {
             Estimate::Joint { joint_ix, value, sigma, unobservable_frac } => {
                 let name = self.rig.and_then(|rig| rig.arm.joints.get(*joint_ix)).map(ToString::to_string);
                 let name = name.unwrap_or_else(|| joint_ix.to_string());
-                let shared = format!("{:.0} % shared with other parameters", 100.0 * unobservable_frac);
+                let shared = format!("{:.0} % not separable from other parameters", 100.0 * unobservable_frac);
                 vec![vec![format!("offset of joint {name}"), format!("{value:.5} ± {sigma:.5} rad or m"), shared]]
             }
             Estimate::Lens { camera, focal_frac, focal_sigma, principal_offset_focals, principal_offset_sigma } => {
@@ -225,6 +226,7 @@ mod tests {
         for words in [
             "time offset of &lt;wrist&gt;",
             "8.000 ± 0.020 ms",
+            "1 correction was accepted.",
             "+0.41 ± 0.04",
             "<td>+0.50</td>",
             "accepted",

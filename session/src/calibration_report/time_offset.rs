@@ -25,10 +25,7 @@ impl TimeOffsetReport<'_> {
     pub fn html(&self) -> String {
         let figures = self.offset.map_or(Vec::new(), figures);
         let verdict = self.offset.map_or(String::new(), |offset| {
-            format!(
-                "Add {} s to the clock of B to get that of A.",
-                with_sigma(offset.offset_secs, offset.sigma_secs, 6)
-            )
+            format!("Add {} s to stamps of B to get stamps of A.", with_sigma(offset.offset_secs, offset.sigma_secs, 6))
         });
         let mut page = Page::new("Time offset", self.heading, &verdict, &figures);
         if let Some(offset) = self.offset {
@@ -105,11 +102,11 @@ fn figures(offset: &TimeOffset) -> Vec<page::Figure> {
 
 fn parameters(offset: &TimeOffset) -> Vec<Vec<String>> {
     let mut rows = vec![
-        vec!["offset to add to the clock of B, s".to_owned(), with_sigma(offset.offset_secs, offset.sigma_secs, 6)],
+        vec!["offset to add to stamps of B, s".to_owned(), with_sigma(offset.offset_secs, offset.sigma_secs, 6)],
         vec!["RMS difference of the orientations, degrees".to_owned(), number(Some(offset.rms_deg), 3)],
     ];
     let drift = offset.drift_ppm.map_or("not significant".to_owned(), |[drift, sigma]| {
-        format!("{}, offset holds at {:.3} s on the clock of B", with_sigma(drift, sigma, 1), offset.mid_secs)
+        format!("{}, offset valid at {:.3} s on the clock of B", with_sigma(drift, sigma, 1), offset.mid_secs)
     });
     rows.push(vec!["drift of A relative to B, ppm".to_owned(), drift]);
     match &offset.hand_eye {
@@ -129,12 +126,13 @@ fn parameters(offset: &TimeOffset) -> Vec<Vec<String>> {
 fn correlation(profile: &MotionProfile, offset: Option<&TimeOffset>) -> String {
     let peak = profile.correlation.iter().max_by(|a, b| a[1].total_cmp(&b[1]));
     let Some(peak) = peak else { return String::new() };
-    // Without a limit, the offset may be that of two epochs: labels are relative to the peak then.
+    // Without a limit, the offset may be the difference between two clock epochs. Labels are then relative to the
+    // peak.
     const MAX_ABSOLUTE_SECS: f64 = 1e5;
     let base_secs = if peak[0].abs() > MAX_ABSOLUTE_SECS { peak[0].round() } else { 0.0 };
     let label = match base_secs == 0.0 {
         true => "offset, s".to_owned(),
-        false => format!("offset minus {base_secs:.0} s, s"),
+        false => format!("offset relative to {base_secs:.0} s (s)"),
     };
     let curve = profile.correlation.iter().map(|[secs, value]| [secs - base_secs, *value]).collect::<Vec<_>>();
     let (at, what) = match offset {
@@ -178,7 +176,7 @@ fn residual(offset: &TimeOffset) -> String {
     })
 }
 
-/// The curve with a point that is not finite in each gap.
+/// Inserts a NaN point into each gap, so that the line is interrupted.
 fn interrupted(curve: &[[f64; 2]]) -> Vec<[f64; 2]> {
     const GAP: f64 = 2.5; // Relative to the smallest step.
     let step = curve.windows(2).map(|pair| pair[1][0] - pair[0][0]).fold(f64::INFINITY, f64::min);

@@ -8,7 +8,7 @@ use std::path::PathBuf;
 /// Flags of `bench calibration`.
 #[derive(Clone, Debug, clap::Args)]
 pub(crate) struct Args {
-    /// Calibrations per kind, for the coverage of the stated uncertainty
+    /// Calibrations per kind, for the coverage of the reported uncertainty
     #[arg(long, value_name = "N", default_value_t = 200, value_parser = clap::value_parser!(u64).range(1..=100_000))]
     runs: u64,
     /// Scenes per number of poses and per combination of conditions

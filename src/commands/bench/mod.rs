@@ -39,7 +39,7 @@ enum BenchCommand {
     Stability(stability::Args),
     /// Errors of image stamps with jitter and clock drift, as a histogram
     Stamps(stamps::Args),
-    /// Accuracy, stated uncertainty, speed and limits of calibration with and without a target
+    /// Accuracy, reported uncertainty, speed and limits of calibration with and without a target
     Calibration(calibration::Args),
     /// Live runs with viewers: latency of pictures, time from shutter to model, and PSNR over time with right and wrong
     /// calibration

@@ -1,4 +1,4 @@
-//! Calibration near a singular posture of the arm, with wrong joint offsets.
+//! Calibration near a singular configuration of the arm, with joint offsets.
 
 use super::method::Errors;
 use super::scene::{brown_conrady, intrinsics, view};
@@ -16,7 +16,7 @@ const HOME_RAD: [f64; 7] = [0.0, -0.5, 0.0, -2.2, 0.0, 0.0, 0.8];
 const WRIST_IX: usize = 5;
 /// Angles of joint 6 from the singularity, degrees.
 const ANGLES_DEG: [f64; 6] = [0.0, 2.0, 5.0, 15.0, 45.0, 90.0];
-/// Standard deviation of joint 6 and of the other joints around the posture, radians.
+/// Standard deviation of joint 6 and of the other joints around the arm configuration, radians.
 const WRIST_SPREAD_RAD: f64 = 0.01;
 const SPREAD_RAD: f64 = 0.2;
 /// Standard deviation of the joint offsets, radians.
@@ -26,16 +26,16 @@ const CORNER_PX: f64 = 0.1;
 
 /// Results at one distance from the singularity.
 #[derive(Clone, Debug, Serialize)]
-pub(super) struct Posture {
+pub(super) struct ArmConfiguration {
     /// Angle of joint 6 from the singularity, degrees.
     pub(super) angle_deg: f64,
     pub(super) estimates_joints: bool,
     pub(super) n_runs: usize,
     pub(super) n_refused: usize,
-    pub(super) n_broken: usize,
+    pub(super) n_failed: usize,
     pub(super) mm: Option<f64>,
     pub(super) deg: Option<f64>,
-    /// Fraction of the offsets of inner joints that are reported as observable.
+    /// Fraction of the offsets of all joints except the first and the last that are reported as observable.
     pub(super) observable_frac: Option<f64>,
     /// Fraction of these within three standard deviations.
     pub(super) within_3_sigma_frac: Option<f64>,
@@ -44,20 +44,20 @@ pub(super) struct Posture {
 /// Result of a run: errors, and the error of each observable joint offset in standard deviations.
 type Run = Option<(Errors, Vec<f64>)>;
 
-/// Measures all postures with and without estimated joint offsets.
-pub(super) fn measure(n_seeds: u64) -> Vec<Posture> {
+/// Measures all arm configurations with and without estimated joint offsets.
+pub(super) fn measure(n_seeds: u64) -> Vec<ArmConfiguration> {
     let chain = Chain::from_urdf(URDF, "panda_link0", "panda_link8").expect("the bundled arm");
     let all = ANGLES_DEG.into_iter().flat_map(|angle_deg| [false, true].map(|joints| (angle_deg, joints)));
     all.map(|(angle_deg, estimates_joints)| {
         let runs = (0..n_seeds).into_par_iter().map(|seed| run(&chain, angle_deg, estimates_joints, seed));
-        Posture::of(angle_deg, estimates_joints, &runs.collect::<Vec<Run>>())
+        ArmConfiguration::of(angle_deg, estimates_joints, &runs.collect::<Vec<Run>>())
     })
     .collect()
 }
 
-impl Posture {
+impl ArmConfiguration {
     fn of(angle_deg: f64, estimates_joints: bool, runs: &[Run]) -> Self {
-        const N_INNER_JOINTS: usize = 5;
+        const N_ESTIMATED_OFFSETS: usize = 5;
         let solved: Vec<&(Errors, Vec<f64>)> = runs.iter().flatten().collect();
         let deviations: Vec<f64> = solved.iter().flat_map(|(_, deviations)| deviations.iter().copied()).collect();
         let n_within = deviations.iter().filter(|deviation| **deviation < 3.0).count();
@@ -69,10 +69,10 @@ impl Posture {
             estimates_joints,
             n_runs: runs.len(),
             n_refused: runs.len() - solved.len(),
-            n_broken: solved.iter().filter(|(errors, _)| errors.is_broken()).count(),
+            n_failed: solved.iter().filter(|(errors, _)| errors.has_failed()).count(),
             mm: column(|errors| errors.mm),
             deg: column(|errors| errors.deg),
-            observable_frac: of_joints(deviations.len() as f64 / (N_INNER_JOINTS * solved.len().max(1)) as f64),
+            observable_frac: of_joints(deviations.len() as f64 / (N_ESTIMATED_OFFSETS * solved.len().max(1)) as f64),
             within_3_sigma_frac: of_joints(n_within as f64 / deviations.len().max(1) as f64),
         }
     }
@@ -87,7 +87,7 @@ fn run(chain: &Chain, angle_deg: f64, estimates_joints: bool, seed: u64) -> Run 
     home[WRIST_IX] += angle_deg.to_radians();
     let offsets: Vec<f64> = home.iter().map(|_| OFFSET_RAD * random.normal()).collect();
     let forward = |joints: &[f64]| chain.forward(joints).expect("seven joints");
-    // In front of the camera at the middle posture.
+    // In front of the camera at the mean arm configuration.
     let base_from_board = forward(&home)
         * flange_from_camera
         * Transform::new(Vector3::new(-0.1, -0.06, 0.5), Vector3::new(0.2, 0.1, 0.0));
