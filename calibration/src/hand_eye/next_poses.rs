@@ -114,7 +114,8 @@ impl Scene<'_> {
                 let a = geometry::a_of(self.input.setup, &base_from_flange);
                 let camera_from_board = refined.solution.camera_from_board(&a);
                 self.is_well_visible(&camera_from_board, distance_m).then_some(())?;
-                let measurement = Measurement { a, camera_from_board, unit_covariance };
+                let measurement =
+                    Measurement { stop_ix: usize::MAX, weight: 1.0, a, camera_from_board, unit_covariance };
                 let (jacobian, weight) =
                     report::residual_information(self.input.setup, &measurement, &refined.solution, &refined.noise)?;
                 let information = DMatrix::from_fn(12, 12, |row, column| {

@@ -211,6 +211,7 @@ fn row(report: &SampleReport) -> BarRow {
         SampleStatus::Used => "",
         SampleStatus::Outlier => "outlier",
         SampleStatus::NoBoard => "too few corners",
+        SampleStatus::Repeated => "identical to an earlier sample",
     };
     let values = vec![report.position_mm, report.rotation_deg, report.rms_px];
     BarRow { name: report.name.clone(), tag: tag.to_owned(), values }
