@@ -156,7 +156,9 @@ pub const MIN_SAMPLES: usize = 3;
 pub fn calibrate_hand_eye(input: &HandEyeInput<'_>) -> Result<HandEyeCalibration, Error> {
     check(input)?;
     let refused = |refusal| Error::Refused(Box::new(refusal));
-    mistakes::check_magnitudes(&input.samples).map_err(refused)?;
+    if let Err(refusal) = mistakes::check_magnitudes(&input.samples) {
+        return Err(refused(mistakes::unit_mistake(input).unwrap_or(refusal)));
+    }
     let robot_poses: Vec<Transform> = input.samples.iter().map(|sample| sample.base_from_flange).collect();
     excitation::check_rotations(&robot_poses, "flange").map_err(refused)?;
 
@@ -193,6 +195,9 @@ pub fn calibrate_hand_eye(input: &HandEyeInput<'_>) -> Result<HandEyeCalibration
     )
     .map_err(|refusal| {
         let doubt = refined.intrinsics_doubt.as_deref();
+        if let Some(refusal) = mistakes::contradiction(&refined, &calibration).filter(|_| doubt.is_none()) {
+            return refused(refusal);
+        }
         refused(with_doubt(refusal.with_warnings(&calibration.warnings, doubt), doubt))
     })?;
     Ok(calibration)

@@ -469,3 +469,23 @@ fn several_images_at_one_stop_do_not_count_as_independent() {
     let n_covered = n_covered.count() as u64;
     assert!((24..=N_RUNS).contains(&n_covered), "{n_covered} of {N_RUNS}");
 }
+
+#[test]
+fn reversed_lists_and_units_are_named() {
+    let scene = Scene::new(Setup::EyeInHand, 12, 0.4, 9);
+    let samples = scene.poses(&Errors { board_rad: 1e-3, board_m: 5e-4, ..Errors::default() }, 3);
+    let mut reversed = samples.clone();
+    for (sample, other) in reversed.iter_mut().zip(samples.iter().rev()) {
+        sample.board = other.board.clone();
+    }
+    let refused = refusal(&scene.input(reversed));
+    assert!(!refused.motion.starts_with("add poses"), "{refused}");
+    for (unit, per_m) in [("millimeters", 1000.0), ("centimeters", 100.0), ("inches", 39.37)] {
+        let mut scaled = samples.clone();
+        for sample in &mut scaled {
+            sample.base_from_flange.translation.vector *= per_m;
+        }
+        let refused = refusal(&scene.input(scaled));
+        assert!(refused.why.contains(unit), "{refused}");
+    }
+}
