@@ -71,8 +71,12 @@ impl HandEyeReport<'_> {
         }
         let reasons = self.unused.iter().map(|unused| vec![unused.name.clone(), unused.reason.clone()]);
         page.table("Not used", &["sample", "reason"], reasons.collect());
-        let legend =
-            "Circles: detected corners. Crosses: where the result expects them, with the robot pose taken as exact.";
+        let legend = match self.calibration {
+            Some(_) => {
+                "Circles: detected corners. Crosses: where the result expects them, with the robot pose taken as exact."
+            }
+            None => "Circles: detected corners.",
+        };
         page.section("Images", legend, &page::gallery(&self.pictures()));
         page.finish()
     }
