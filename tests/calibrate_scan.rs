@@ -117,7 +117,7 @@ fn unusable_scans_are_rejected_with_the_reason() {
     write_rig(folder, "rig.toml", |_| ());
     for (args, expected) in [
         (&["bad.toml", "--sim", "--target", TARGET][..], "sim.target.board"),
-        (&["rig.toml", "--sim"], "--target is missing"),
+        (&["rig.toml", "--sim"], "--target is required"),
         (&["samples.json", "--with-joints"], "--urdf and --tip are needed"),
         (&["rig.toml", "--sim", "--target", TARGET, "--urdf", "a.urdf", "--tip", "b"], "names the robot description"),
         (&["rig.toml", "--sim", "--target", TARGET, "--camera", "front"], "it has wrist"),

@@ -127,7 +127,9 @@ impl<'a> Reader<'a> {
             )));
         };
         if rig.has_moving_base() {
-            bail!("the base moves: calibration with a target needs a fixed base (base.driver = \"fixed\")");
+            bail!(
+                "base.driver: the base moves, but calibration with a target needs a fixed base; while the base stands still, use a copy of the rig file with base.driver = \"fixed\""
+            );
         }
         let arm = (rig.arm.driver != ArmDriver::None).then(|| Arm::new(rig)).transpose()?;
         Ok(Self {

@@ -1,7 +1,7 @@
 //! Minimization of the reprojection error over hand-eye, board pose, robot pose errors and, when asked, intrinsics and
 //! joint offsets.
 //!
-//! Each robot pose has a small unknown error with an estimated variance. These local parameters are eliminated by the
+//! Each stop of the robot has a small unknown error with an estimated variance. These local parameters are eliminated by the
 //! Schur complement of the solver.
 
 use super::geometry::{N_PARAMS, Solution};
@@ -27,7 +27,8 @@ pub(super) struct View {
 /// The minimization problem.
 pub(super) struct CornerProblem<'a> {
     pub(super) setup: Setup,
-    pub(super) views: &'a [View],
+    /// The images at each stop of the robot.
+    pub(super) stops: &'a [Vec<View>],
     pub(super) noise: HandEyeNoise,
     /// Number of intrinsics to estimate: all, or 0.
     pub(super) n_intrinsics: usize,
@@ -42,7 +43,7 @@ pub(super) struct CornerState {
     pub(super) intrinsics: Intrinsics,
     /// One per inner joint, radians or meters.
     pub(super) joint_offsets: Vec<f64>,
-    /// Error of each robot pose: rotation vector and translation in flange axes.
+    /// Error of the robot pose at each stop: rotation vector and translation in flange axes.
     pub(super) pose_errors: Vec<Vector6<f64>>,
 }
 
@@ -73,35 +74,15 @@ impl CornerProblem<'_> {
         let inner = twists[1..twists.len() - 1].iter().map(|twist| twist.of_attached(&tip_from_flange)).collect();
         Some((chain.forward(&corrected).ok()? * tip_from_flange, inner))
     }
-}
 
-/// Joint values plus the offsets of the inner joints.
-pub(super) fn corrected_joints(joints: &[f64], offsets: &[f64]) -> Vec<f64> {
-    let mut corrected = joints.to_vec();
-    for (joint, offset) in corrected.iter_mut().skip(1).zip(offsets) {
-        *joint += offset;
-    }
-    corrected
-}
-
-impl least_squares::Problem for CornerProblem<'_> {
-    type State = CornerState;
-
-    fn scales(&self) -> DVector<f64> {
-        DVector::from_element(N_PARAMS + self.n_intrinsics + self.n_joints(), 1.0)
-    }
-
-    fn n_blocks(&self) -> usize {
-        self.views.len()
-    }
-
-    fn n_local(&self, _block_ix: usize) -> usize {
-        6
-    }
-
-    fn evaluate(&self, state: &CornerState, block_ix: usize, sums: &mut BlockSums) -> Option<()> {
-        let view = &self.views[block_ix];
-        let error = &state.pose_errors[block_ix];
+    /// Adds the residuals of one image.
+    fn evaluate_view(
+        &self,
+        state: &CornerState,
+        view: &View,
+        error: &Vector6<f64>,
+        sums: &mut BlockSums,
+    ) -> Option<()> {
         let (base_from_flange, joint_twists) = self.corrected_pose(view, &state.joint_offsets)?;
         let chain = PointChain::new(self.setup, &state.solution, &base_from_flange, error);
         let n_intrinsics = self.n_intrinsics;
@@ -132,6 +113,40 @@ impl least_squares::Problem for CornerProblem<'_> {
             }
             let residual = [0, 1].map(|axis| (projection.pixel[axis] - point.pixel[axis]) / corner_px);
             sums.add(residual, [rows[0].as_slice(), rows[1].as_slice()]);
+        }
+        Some(())
+    }
+}
+
+/// Joint values plus the offsets of the inner joints.
+pub(super) fn corrected_joints(joints: &[f64], offsets: &[f64]) -> Vec<f64> {
+    let mut corrected = joints.to_vec();
+    for (joint, offset) in corrected.iter_mut().skip(1).zip(offsets) {
+        *joint += offset;
+    }
+    corrected
+}
+
+impl least_squares::Problem for CornerProblem<'_> {
+    type State = CornerState;
+
+    fn scales(&self) -> DVector<f64> {
+        DVector::from_element(N_PARAMS + self.n_intrinsics + self.n_joints(), 1.0)
+    }
+
+    fn n_blocks(&self) -> usize {
+        self.stops.len()
+    }
+
+    fn n_local(&self, _block_ix: usize) -> usize {
+        6
+    }
+
+    fn evaluate(&self, state: &CornerState, block_ix: usize, sums: &mut BlockSums) -> Option<()> {
+        let error = &state.pose_errors[block_ix];
+        let n_shared = N_PARAMS + self.n_intrinsics + self.n_joints();
+        for view in &self.stops[block_ix] {
+            self.evaluate_view(state, view, error, sums)?;
         }
         for (first, sigma) in [(0, self.noise.rotation_rad), (3, self.noise.translation_m)] {
             for ix in first..first + 3 {

@@ -32,8 +32,8 @@ pub(super) fn scatter(boards: &[Transform]) -> Option<Scatter> {
 /// Largest number of fits of a cross-validation. With more measurements, several are left out at a time.
 pub const MAX_FOLDS: usize = 60;
 
-/// For each measurement, the solution of the others: leave-one-out, or with many measurements cross-validation in
-/// [`MAX_FOLDS`] interleaved folds.
+/// For each measurement, the solution of the others: stops are left out one by one, or with many stops in [`MAX_FOLDS`]
+/// interleaved folds.
 ///
 /// * `knows_noise`: keeps the given noise, which is faster than estimating it without the measurement.
 pub(super) fn held_out_solutions(
@@ -43,16 +43,20 @@ pub(super) fn held_out_solutions(
     noise: HandEyeNoise,
     knows_noise: bool,
 ) -> Vec<Option<Solution>> {
-    let n_folds = measurements.len().min(MAX_FOLDS);
+    let mut stops: Vec<usize> = measurements.iter().map(|measurement| measurement.stop_ix).collect();
+    stops.sort_unstable();
+    stops.dedup();
+    let n_folds = stops.len().min(MAX_FOLDS);
+    let fold_of = |measurement: &Measurement| stops.partition_point(|stop| *stop < measurement.stop_ix) % n_folds;
+    let n_left_out = stops.len().div_ceil(n_folds.max(1));
     let without = |fold: usize| {
-        let others = measurements.iter().enumerate().filter(|(ix, _)| ix % n_folds != fold);
-        let others: Vec<Measurement> = others.map(|(_, measurement)| measurement.clone()).collect();
-        (others.len() >= 3).then_some(())?;
+        let others: Vec<Measurement> = measurements.iter().filter(|other| fold_of(other) != fold).cloned().collect();
+        (stops.len() >= n_left_out + 3).then_some(())?;
         let fit = if knows_noise { pose_fit::fit_with_known_noise } else { pose_fit::fit };
         Some(fit(setup, &others, solution, noise).ok()?.solution)
     };
     let folds: Vec<Option<Solution>> = (0..n_folds).map(without).collect();
-    (0..measurements.len()).map(|ix| folds[ix % n_folds]).collect()
+    measurements.iter().map(|measurement| folds[fold_of(measurement)]).collect()
 }
 
 /// Sum of squared reprojection errors, square pixels; infinite if a point cannot be projected.

@@ -27,7 +27,7 @@ impl IntrinsicsDoubt {
         (decrease > n_params + 6.0 * (2.0 * n_params).sqrt()).then_some(())?;
         let change = fixed.state.solution.x.inverse() * free.state.solution.x;
         let warning = format!(
-            "the corners contradict the given intrinsics: with free intrinsics, {}, and the camera moves by {:.1} mm and {:.2} degrees, which is included in the uncertainty; calibrate the intrinsics, or estimate them here",
+            "the corners contradict the given intrinsics: with free intrinsics, {}, and the camera moves by {:.1} mm and {:.2} degrees, which is included in the uncertainty; calibrate the intrinsics with calibrate intrinsics, or estimate them together with the pose (--with-intrinsics)",
             change_of_intrinsics(intrinsics, &free.state.intrinsics),
             1e3 * change.translation.vector.norm(),
             change.rotation.angle().to_degrees()

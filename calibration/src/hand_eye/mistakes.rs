@@ -3,8 +3,10 @@
 use super::closed_form::{self, ClosedForm};
 use super::consensus::{self, Consensus};
 use super::geometry;
+use super::refine::Refined;
 use super::refusal::Refusal;
-use super::samples::Sample;
+use super::report::HandEyeCalibration;
+use super::samples::{self, Sample};
 use super::{BoardObservation, HandEyeInput, HandEyeSample, Setup};
 use kinematics::Transform;
 
@@ -71,10 +73,10 @@ pub(super) fn explain(input: &HandEyeInput<'_>, samples: &[Sample], consensus: O
         return is_inverted.then(|| {
             Refusal::new(
                 format!(
-                    "the board is behind the camera in {n_behind} of {} samples: the given matrices are board_from_camera",
+                    "the board is behind the camera in {n_behind} of {} samples: either the camera has the axes of OpenGL (y up, z backward), expected x right, y down, z forward; or the given matrices are board_from_camera",
                     samples.len()
                 ),
-                "invert the board poses, and check that the robot poses are base_from_flange",
+                "negate the second and third row of camera_from_board in the first case; in the second, invert the board poses, and check that the robot poses are base_from_flange",
             )
         });
     }
@@ -108,6 +110,32 @@ pub(super) fn explain(input: &HandEyeInput<'_>, samples: &[Sample], consensus: O
         (true, true) => {
             Refusal::new(format!("{fits} {robot}; or if {board}"), format!("{robot_remedy}, or invert the board poses"))
         }
+    })
+}
+
+/// Positions of the robot or the board that are in another unit than the others.
+pub(super) fn unit_mistake(input: &HandEyeInput<'_>) -> Option<Refusal> {
+    let samples = samples::samples(input, input.intrinsics.as_ref()).usable;
+    let (why, remedy) = scale_mistake(&samples, consensus::find(&samples).as_ref())?;
+    Some(Refusal::new(why, remedy))
+}
+
+/// Samples that contradict each other, which more samples do not change.
+pub(super) fn contradiction(refined: &Refined, calibration: &HandEyeCalibration) -> Option<Refusal> {
+    /// Scatter of the board relative to its distance. Detections and robots are far more accurate.
+    const MAX_FRAC: f64 = 0.05;
+    let distances: Vec<f64> =
+        refined.measurements().iter().map(|found| found.camera_from_board.translation.vector.norm()).collect();
+    let distance_m = kinematics::quantile::median(&distances)?;
+    let scatter_mm = calibration.scatter.mm;
+    (scatter_mm > 1e3 * MAX_FRAC * distance_m).then(|| {
+        Refusal::new(
+            format!(
+                "the robot poses and the board poses contradict each other: the board scatters by {scatter_mm:.0} mm (RMS, board at {:.0} mm)",
+                1e3 * distance_m
+            ),
+            "check that each robot pose belongs to its image or board pose (the order of both lists), and that neither board nor camera was moved",
+        )
     })
 }
 
@@ -178,24 +206,27 @@ fn scale_mistake(samples: &[Sample], consensus: Option<&Consensus>) -> Option<(S
     if explained_m * BETTER > consensus.map_or(f64::INFINITY, Consensus::median_m) {
         return None;
     }
+    /// Units and how many make a meter.
+    const UNITS: [(&str, f64); 3] = [("millimeters", 1000.0), ("centimeters", 100.0), ("inches", 39.37)];
     let near = |expected: f64| (scale / expected - 1.0).abs() < 0.1;
+    let unit_of = |value: f64| UNITS.into_iter().find(|(_, per_m)| (value / per_m - 1.0).abs() < 0.1);
+    let why = |body: &str, other: &str, unit: &str, per_m: f64| {
+        format!(
+            "the positions of {body} are {per_m} times too large relative to those of {other}: they are probably in {unit}"
+        )
+    };
     Some(if near(-1.0) {
         (
             "the board moves mirrored relative to the robot: the images are flipped, or the target was printed mirrored"
                 .to_owned(),
             "turn off mirroring in the camera, or print the target again".to_owned(),
         )
-    } else if near(1000.0) {
+    } else if let Some((unit, per_m)) = unit_of(scale) {
+        (why("the robot", "the board", unit, per_m), format!("divide the positions of base_from_flange by {per_m}"))
+    } else if let Some((unit, per_m)) = unit_of(1.0 / scale) {
         (
-            "the positions of the robot are 1000 times too large relative to those of the board: they are probably in millimeters"
-                .to_owned(),
-            "divide the positions of base_from_flange by 1000".to_owned(),
-        )
-    } else if near(0.001) {
-        (
-            "the positions of the board are 1000 times too large relative to those of the robot: they are probably in millimeters"
-                .to_owned(),
-            "divide the positions of camera_from_board, or the size of the board, by 1000".to_owned(),
+            why("the board", "the robot", unit, per_m),
+            format!("divide the positions of camera_from_board, or the size of the board, by {per_m}"),
         )
     } else {
         (

@@ -40,6 +40,7 @@ pub use shutter::{FlangeMotion, corners_at_mid_exposure};
 
 use crate::{BoardView, Error};
 use kinematics::{Chain, Intrinsics, Transform, transform};
+use samples::Sorted;
 
 /// Where the camera and the board are mounted.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -155,13 +156,21 @@ pub const MIN_SAMPLES: usize = 3;
 pub fn calibrate_hand_eye(input: &HandEyeInput<'_>) -> Result<HandEyeCalibration, Error> {
     check(input)?;
     let refused = |refusal| Error::Refused(Box::new(refusal));
-    mistakes::check_magnitudes(&input.samples).map_err(refused)?;
+    if let Err(refusal) = mistakes::check_magnitudes(&input.samples) {
+        return Err(refused(mistakes::unit_mistake(input).unwrap_or(refusal)));
+    }
     let robot_poses: Vec<Transform> = input.samples.iter().map(|sample| sample.base_from_flange).collect();
     excitation::check_rotations(&robot_poses, "flange").map_err(refused)?;
 
-    let (samples, without_board) = samples::samples(input, input.intrinsics.as_ref());
+    let Sorted { usable: samples, without_board, repeated } = samples::samples(input, input.intrinsics.as_ref());
     if samples.len() < MIN_SAMPLES {
-        return Err(refused(too_few(samples.len(), "have a usable view of the board")));
+        let different = if repeated.is_empty() { "" } else { "different " };
+        let n = samples.len();
+        return Err(refused(too_few(
+            n,
+            different,
+            if n == 1 { "has a usable view of the board" } else { "have a usable view of the board" },
+        )));
     }
     let consensus = consensus::find(&samples);
     if let Some(refusal) = mistakes::explain(input, &samples, consensus.as_ref()) {
@@ -176,7 +185,7 @@ pub fn calibrate_hand_eye(input: &HandEyeInput<'_>) -> Result<HandEyeCalibration
     let refined = refine::refine(input, samples, consensus)?;
     let used: Vec<Transform> = refined.used().map(|sample| input.samples[sample.sample_ix].base_from_flange).collect();
     excitation::check_rotations(&used, "flange").map_err(refused)?;
-    let calibration = report::report(input, &refined, &without_board)?;
+    let calibration = report::report(input, &refined, &without_board, &repeated)?;
     excitation::check_uncertainty(
         &refined.covariance,
         &refined.solution,
@@ -186,6 +195,9 @@ pub fn calibrate_hand_eye(input: &HandEyeInput<'_>) -> Result<HandEyeCalibration
     )
     .map_err(|refusal| {
         let doubt = refined.intrinsics_doubt.as_deref();
+        if let Some(refusal) = mistakes::contradiction(&refined, &calibration).filter(|_| doubt.is_none()) {
+            return refused(refusal);
+        }
         refused(with_doubt(refusal.with_warnings(&calibration.warnings, doubt), doubt))
     })?;
     Ok(calibration)
@@ -199,9 +211,10 @@ fn with_doubt(refusal: Refusal, doubt: Option<&str>) -> Refusal {
     }
 }
 
-fn too_few(n: usize, what: &str) -> Refusal {
+fn too_few(n: usize, kind: &str, what: &str) -> Refusal {
+    let samples = if n == 1 { "sample" } else { "samples" };
     Refusal::new(
-        format!("{n} samples {what}; at least {MIN_SAMPLES} are needed, and 12 or more are recommended"),
+        format!("{n} {kind}{samples} {what}; at least {MIN_SAMPLES} are needed, and 12 or more are recommended"),
         "add poses that rotate the flange by at least 20 degrees around different axes",
     )
 }
@@ -210,7 +223,8 @@ fn too_few(n: usize, what: &str) -> Refusal {
 fn check(input: &HandEyeInput<'_>) -> Result<(), Error> {
     let invalid = |why: String| Err(Error::HandEyeInput { why });
     if input.samples.len() < MIN_SAMPLES {
-        return Err(Error::Refused(Box::new(too_few(input.samples.len(), "were given"))));
+        let n = input.samples.len();
+        return Err(Error::Refused(Box::new(too_few(n, "", if n == 1 { "was given" } else { "were given" }))));
     }
     let is_view = |sample: &HandEyeSample| matches!(sample.board, BoardObservation::View(_));
     let n_views = input.samples.iter().filter(|sample| is_view(sample)).count();

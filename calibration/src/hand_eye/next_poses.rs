@@ -54,14 +54,21 @@ pub fn suggest_next_poses(
         None => return Vec::new(),
     };
     let candidates = scene.candidates();
-    let mut suggested = Vec::new();
+    let mut suggested: Vec<NextPose> = Vec::new();
     for _ in 0..options.n_poses {
         let Some(before) = log_volume(&information) else { break };
         let gain = |candidate: &Candidate| {
             let with = &information + &candidate.information;
             log_volume(&with).map_or(0.0, |after| before - after)
         };
-        let best = candidates.iter().map(|candidate| (gain(candidate), candidate)).max_by(|a, b| a.0.total_cmp(&b.0));
+        let is_new = |candidate: &&Candidate| {
+            suggested.iter().all(|earlier| earlier.base_from_flange != candidate.base_from_flange)
+        };
+        let best = candidates
+            .iter()
+            .filter(is_new)
+            .map(|candidate| (gain(candidate), candidate))
+            .max_by(|a, b| a.0.total_cmp(&b.0));
         let Some((gain, best)) = best.filter(|(gain, _)| *gain > 0.0) else { break };
         information += &best.information;
         suggested.push(NextPose {
@@ -114,7 +121,8 @@ impl Scene<'_> {
                 let a = geometry::a_of(self.input.setup, &base_from_flange);
                 let camera_from_board = refined.solution.camera_from_board(&a);
                 self.is_well_visible(&camera_from_board, distance_m).then_some(())?;
-                let measurement = Measurement { a, camera_from_board, unit_covariance };
+                let measurement =
+                    Measurement { stop_ix: usize::MAX, weight: 1.0, a, camera_from_board, unit_covariance };
                 let (jacobian, weight) =
                     report::residual_information(self.input.setup, &measurement, &refined.solution, &refined.noise)?;
                 let information = DMatrix::from_fn(12, 12, |row, column| {
@@ -208,10 +216,15 @@ impl Scene<'_> {
         let axis = if vector.norm() > 0.0 { vector.normalize() } else { Vector3::z() };
         let signed_deg = angle_deg * axis[axis.iamax()].signum();
         let name = excitation::axis_name(&axis, body);
+        let moved = match self.input.setup {
+            Setup::EyeInHand => x.rotation.inverse() * old_from_new.translation.vector,
+            Setup::EyeToHand => old_from_new.translation.vector,
+        };
+        // Adding zero turns a negative zero into a positive one.
+        let [right, down, forward]: [f64; 3] = moved.map(|meters| (1e3 * meters).round() + 0.0).into();
         format!(
-            "from the pose of {:?}, rotate the flange by {signed_deg:.0} degrees around {name} and move it by {:.0} mm",
-            sample.name,
-            1e3 * old_from_new.translation.vector.norm()
+            "from the pose of {:?}, rotate the flange by {signed_deg:.0} degrees around {name} and move it by ({right}, {down}, {forward}) mm along the {body}'s x, y and z axes",
+            sample.name
         )
     }
 }

@@ -61,23 +61,42 @@ impl HandEyeNoise {
 /// One sample with the chosen board pose.
 #[derive(Clone, Debug)]
 pub(super) struct Measurement {
+    /// See [`Sample`].
+    pub(super) stop_ix: usize,
+    /// One divided by the number of measurements of the stop. The error of the robot pose is common to them, so that a
+    /// stop counts once.
+    pub(super) weight: f64,
     pub(super) a: Transform,
     pub(super) camera_from_board: Transform,
     /// Covariance of the pose for corners with an error of one pixel; `None` for given poses.
     pub(super) unit_covariance: Option<Matrix6<f64>>,
 }
 
-/// The chosen candidate of each sample.
+/// The chosen candidate of each sample, with weights for all of them.
 pub(super) fn measurements(samples: &[Sample], choice: &[usize]) -> Vec<Measurement> {
     let of = |(sample, choice): (&Sample, &usize)| {
         let candidate = &sample.candidates[*choice];
         Measurement {
+            stop_ix: sample.stop_ix,
+            weight: 1.0,
             a: sample.a,
             camera_from_board: candidate.camera_from_board,
             unit_covariance: candidate.corners.as_ref().map(|corners| corners.unit_covariance),
         }
     };
-    samples.iter().zip(choice).map(of).collect()
+    with_weights(samples.iter().zip(choice).map(of).collect())
+}
+
+/// Weighs measurements such that each stop counts once.
+pub(super) fn with_weights(mut measurements: Vec<Measurement>) -> Vec<Measurement> {
+    let mut n_of_stop = std::collections::BTreeMap::<usize, usize>::new();
+    for measurement in &measurements {
+        *n_of_stop.entry(measurement.stop_ix).or_default() += 1;
+    }
+    for measurement in &mut measurements {
+        measurement.weight = 1.0 / n_of_stop[&measurement.stop_ix] as f64;
+    }
+    measurements
 }
 
 /// Result of [`fit`].
@@ -165,8 +184,10 @@ pub(super) fn sandwich_covariance(
         let residual = geometry::residual(&predicted, &measurement.camera_from_board);
         let jacobian = geometry::residual_jacobian(&predicted, &residual);
         let weighted = covariance(setup, measurement, solution, weighting).cholesky()?.inverse() * jacobian;
-        information += jacobian.transpose() * weighted;
-        scatter += weighted.transpose() * covariance(setup, measurement, solution, noise) * weighted;
+        information += jacobian.transpose() * weighted * measurement.weight;
+        // The errors at one stop are taken as equal.
+        scatter +=
+            weighted.transpose() * covariance(setup, measurement, solution, noise) * weighted * measurement.weight;
     }
     let inverse = information.try_inverse()?;
     let covariance = inverse * scatter * inverse;
@@ -257,7 +278,8 @@ impl<'a> Whitened<'a> {
     fn new(setup: Setup, measurements: &'a [Measurement], solution: &Solution, noise: &HandEyeNoise) -> Self {
         let whitening = |measurement: &Measurement| {
             let factor = covariance(setup, measurement, solution, noise).cholesky();
-            factor.and_then(|factor| factor.l().try_inverse()).unwrap_or_else(Matrix6::zeros)
+            let whitening = factor.and_then(|factor| factor.l().try_inverse()).unwrap_or_else(Matrix6::zeros);
+            whitening * measurement.weight.sqrt()
         };
         let lever_m = measurements.iter().map(|m| m.camera_from_board.translation.vector.norm()).fold(0.01, f64::max);
         Self { measurements, whitening: measurements.iter().map(whitening).collect(), lever_m }
@@ -314,6 +336,7 @@ fn update_variances(
     let mut fisher = DMatrix::<f64>::zeros(n_variances, n_variances);
     let mut log_volume_by_variance = DVector::<f64>::zeros(n_variances);
     for measurement in measurements {
+        let count = measurement.weight;
         let parts = covariance_parts(setup, measurement, solution, noise);
         let Some(weight) = total(&parts, &variances).cholesky().map(|factor| factor.inverse()) else { continue };
         let predicted = solution.camera_from_board(&measurement.a);
@@ -324,20 +347,20 @@ fn update_variances(
         let projected = &inverse * (jacobian.transpose() * weight);
         let remaining = weight - weight * jacobian * &projected;
         for (k, part) in parts.iter().enumerate() {
-            squares[k] += robust * weighted.dot(&(part * weighted));
-            expected[k] += (remaining * part).trace();
+            squares[k] += count * robust * weighted.dot(&(part * weighted));
+            expected[k] += count * (remaining * part).trace();
             let weighted_part = weight * part * weight;
             for (l, other) in parts.iter().enumerate() {
-                fisher[(k, l)] += 0.5 * (weighted_part * other).trace();
+                fisher[(k, l)] += count * 0.5 * (weighted_part * other).trace();
             }
             if let Some(x_information) = &x_information {
                 let change = &projected * *part * projected.transpose();
-                log_volume_by_variance[k] += (x_information * change.view((0, 0), (6, 6))).trace() / 6.0;
+                log_volume_by_variance[k] += count * (x_information * change.view((0, 0), (6, 6))).trace() / 6.0;
             }
         }
     }
     // A part of the residuals' information is spent on the parameters.
-    let n_scalars = 6.0 * measurements.len() as f64;
+    let n_scalars = 6.0 * measurements.iter().map(|measurement| measurement.weight).sum::<f64>();
     fisher *= ((n_scalars - N_PARAMS as f64) / n_scalars).max(0.05);
     let updated: Vec<f64> = (0..n_variances)
         .map(|k| {

@@ -129,7 +129,7 @@ fn minimize_free(
         intrinsics = fit.state.intrinsics.clone();
         offsets.clone_from(&fit.state.joint_offsets);
         let corrected = with_offsets(input, &offsets);
-        let usable = samples::samples(&corrected, Some(&intrinsics)).0;
+        let usable = samples::samples(&corrected, Some(&intrinsics)).usable;
         if usable.len() != samples.len() {
             return Err(Error::Refused(Box::new(Refusal::new(
                 "with the estimated intrinsics, some images have no board pose",

@@ -6,6 +6,7 @@ use super::geometry;
 use super::mistakes;
 use super::pose_fit::{self, HandEyeNoise, Measurement};
 use super::refine::{self, Refined};
+use super::samples;
 use super::selection;
 use super::{HandEyeInput, Setup};
 use crate::least_squares::sigma_of;
@@ -73,6 +74,8 @@ pub enum SampleStatus {
     Outlier,
     /// The corners do not determine a pose of the board.
     NoBoard,
+    /// Identical to an earlier sample, which counts once.
+    Repeated,
 }
 
 /// Errors of one sample.
@@ -105,6 +108,7 @@ pub(super) fn report(
     input: &HandEyeInput<'_>,
     refined: &Refined,
     without_board: &[usize],
+    repeated: &[usize],
 ) -> Result<HandEyeCalibration, Error> {
     let measurements = refined.measurements();
     let boards = measurements.iter().map(|m| refine::board_in_parent(&refined.solution, m));
@@ -113,7 +117,11 @@ pub(super) fn report(
     let held_out = HeldOut::new(input, refined, &measurements);
     let covariance = position_first(&refined.covariance.fixed_view::<6, 6>(0, 0).into_owned());
     let sigma = |first: usize| [0, 1, 2].map(|axis| sigma_of(covariance[(first + axis, first + axis)]));
-    let samples = sample_reports(input, refined, without_board);
+    let mut samples = sample_reports(input, refined);
+    debug_assert_eq!(refined.samples.len() + without_board.len() + repeated.len(), samples.len());
+    for ix in repeated {
+        samples[*ix].status = SampleStatus::Repeated;
+    }
     Ok(HandEyeCalibration {
         setup: input.setup,
         parent_from_camera: refined.solution.x,
@@ -159,8 +167,7 @@ impl HeldOut {
             .zip(measurements)
             .map(|(solution, m)| Some(refine::board_in_parent(solution.as_ref()?, m)))
             .collect();
-        let scatter =
-            boards.filter(|boards| boards.len() > super::MIN_SAMPLES).and_then(|boards| evaluation::scatter(&boards));
+        let scatter = boards.filter(|boards| !boards.is_empty()).and_then(|boards| evaluation::scatter(&boards));
         let rms_px = scatter.and_then(|_| rms_px(input, refined, |used_ix| folds[used_ix]));
         Self { scatter, rms_px }
     }
@@ -184,7 +191,7 @@ fn rms_px(
     (n > 0).then(|| (squares / n as f64).sqrt())
 }
 
-fn sample_reports(input: &HandEyeInput<'_>, refined: &Refined, without_board: &[usize]) -> Vec<SampleReport> {
+fn sample_reports(input: &HandEyeInput<'_>, refined: &Refined) -> Vec<SampleReport> {
     let mut reports: Vec<SampleReport> = input
         .samples
         .iter()
@@ -199,7 +206,6 @@ fn sample_reports(input: &HandEyeInput<'_>, refined: &Refined, without_board: &[
             points: Vec::new(),
         })
         .collect();
-    debug_assert_eq!(refined.samples.len() + without_board.len(), reports.len(), "every sample is usable or not");
     for (ix, sample) in refined.samples.iter().enumerate() {
         let report = &mut reports[sample.sample_ix];
         let residual = refine::sample_residual(&refined.solution, sample, refined.choice[ix]);
@@ -270,9 +276,25 @@ fn warnings(input: &HandEyeInput<'_>, refined: &Refined, reports: &[SampleReport
     if !mirrored.is_empty() {
         warnings.push(format!("{} samples show the board mirrored: {}", mirrored.len(), mirrored.join(", ")));
     }
+    let repeated = named(SampleStatus::Repeated);
+    if !repeated.is_empty() {
+        let what = if repeated.len() == 1 { "sample is" } else { "samples are" };
+        warnings.push(format!(
+            "{} {what} identical to an earlier one and not used again: {}",
+            repeated.len(),
+            repeated.join(", ")
+        ));
+    }
     let n_used = refined.is_inlier.iter().filter(|is_inlier| **is_inlier).count();
-    if n_used < 6 {
-        warnings.push(format!("only {n_used} samples were used: with fewer than 6, wrong samples may go unnoticed"));
+    let n_stops = samples::n_stops(&refined.samples, &refined.is_inlier);
+    if n_stops < n_used {
+        warnings.push(format!(
+            "{n_used} samples were taken at {n_stops} different robot poses: samples at the same pose share its error and count as one"
+        ));
+    }
+    if n_stops < 6 {
+        warnings
+            .push(format!("only {n_stops} robot poses were used: with fewer than 6, wrong samples may go unnoticed"));
     }
     warnings
 }

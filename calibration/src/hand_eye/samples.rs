@@ -1,7 +1,7 @@
 //! Samples with all poses of the board that their measurements allow.
 
 use super::planar_pose::{self, BoardPose};
-use super::{BoardObservation, HandEyeInput, geometry};
+use super::{BoardObservation, HandEyeInput, HandEyeSample, geometry};
 use kinematics::Transform;
 use nalgebra::Matrix6;
 
@@ -10,6 +10,8 @@ use nalgebra::Matrix6;
 pub(super) struct Sample {
     /// Index in the input.
     pub(super) sample_ix: usize,
+    /// Index of the stop: samples at the same robot pose share it, and the error of that pose.
+    pub(super) stop_ix: usize,
     /// See [`geometry::Solution`].
     pub(super) a: Transform,
     /// Poses of the board, the most likely first. Not empty.
@@ -37,13 +39,25 @@ pub(super) struct CornerStatistics {
     pub(super) is_inlier: Vec<bool>,
 }
 
-/// Candidates of all samples, and the indices of the samples without any.
-pub(super) fn samples(
-    input: &HandEyeInput<'_>,
-    intrinsics: Option<&kinematics::Intrinsics>,
-) -> (Vec<Sample>, Vec<usize>) {
-    let (mut found, mut without) = (Vec::new(), Vec::new());
+/// The samples of an input, by use.
+pub(super) struct Sorted {
+    /// Samples with candidates.
+    pub(super) usable: Vec<Sample>,
+    /// Indices of samples whose measurement allows no pose of the board.
+    pub(super) without_board: Vec<usize>,
+    /// Indices of samples that are identical to an earlier one. They contain no further information.
+    pub(super) repeated: Vec<usize>,
+}
+
+/// Candidates of all samples that differ from each other.
+pub(super) fn samples(input: &HandEyeInput<'_>, intrinsics: Option<&kinematics::Intrinsics>) -> Sorted {
+    let mut sorted = Sorted { usable: Vec::new(), without_board: Vec::new(), repeated: Vec::new() };
+    let mut stops: Vec<Transform> = Vec::new();
     for (sample_ix, sample) in input.samples.iter().enumerate() {
+        if input.samples[..sample_ix].iter().any(|earlier| is_same(earlier, sample)) {
+            sorted.repeated.push(sample_ix);
+            continue;
+        }
         let poses: Vec<Candidate> = match (&sample.board, intrinsics) {
             (BoardObservation::Pose(pose), _) => vec![Candidate {
                 camera_from_board: *pose,
@@ -56,7 +70,7 @@ pub(super) fn samples(
             (BoardObservation::View(_), None) => Vec::new(),
         };
         if poses.is_empty() {
-            without.push(sample_ix);
+            sorted.without_board.push(sample_ix);
             continue;
         }
         let mut candidates = Vec::new();
@@ -70,9 +84,38 @@ pub(super) fn samples(
             ));
         }
         let a = geometry::a_of(input.setup, &sample.base_from_flange);
-        found.push(Sample { sample_ix, a, candidates });
+        let stop_ix = stops.iter().position(|stop| is_same_stop(stop, &sample.base_from_flange));
+        let stop_ix = stop_ix.unwrap_or_else(|| {
+            stops.push(sample.base_from_flange);
+            stops.len() - 1
+        });
+        sorted.usable.push(Sample { sample_ix, stop_ix, a, candidates });
     }
-    (found, without)
+    sorted
+}
+
+/// Whether two samples have the same values.
+fn is_same(a: &HandEyeSample, b: &HandEyeSample) -> bool {
+    let is_same_board = match (&a.board, &b.board) {
+        (BoardObservation::Pose(a), BoardObservation::Pose(b)) => a == b,
+        (BoardObservation::View(a), BoardObservation::View(b)) => a.points == b.points,
+        _ => false,
+    };
+    is_same_board && a.base_from_flange == b.base_from_flange && a.joints == b.joints
+}
+
+/// Whether a robot reports the same pose twice, up to the noise of its encoders.
+fn is_same_stop(a: &Transform, b: &Transform) -> bool {
+    const SAME_M: f64 = 5e-4;
+    const SAME_RAD: f64 = 1e-3;
+    let difference = a.inverse() * b;
+    difference.translation.vector.norm() < SAME_M && difference.rotation.angle() < SAME_RAD
+}
+
+/// Number of different stops of the samples that are selected.
+pub(super) fn n_stops(samples: &[Sample], is_inlier: &[bool]) -> usize {
+    let used = samples.iter().zip(is_inlier).filter(|(_, is_inlier)| **is_inlier);
+    used.map(|(sample, _)| sample.stop_ix).collect::<std::collections::BTreeSet<_>>().len()
 }
 
 fn is_identity(transform: &Transform) -> bool {

@@ -4,7 +4,7 @@ use super::consensus;
 use super::corner_fit::{CornerProblem, CornerState, View};
 use super::geometry::{N_PARAMS, Solution};
 use super::pose_fit::{self, HandEyeNoise, Measurement, PoseFit};
-use super::samples::Sample;
+use super::samples::{self, Sample};
 use super::{BoardObservation, HandEyeInput, MIN_SAMPLES, Refusal};
 use crate::least_squares::Fit;
 use crate::{BoardPoint, Error};
@@ -36,7 +36,7 @@ pub(super) fn reject_and_fit(
     let mut stage = None;
     for _ in 0..MAX_ROUNDS {
         let n_used = is_inlier.iter().filter(|is_inlier| **is_inlier).count();
-        if n_used < MIN_SAMPLES || 2 * n_used < samples.len() {
+        if 2 * n_used < samples.len() || samples::n_stops(samples, &is_inlier) < MIN_SAMPLES {
             return Err(Error::Refused(Box::new(Refusal::new(
                 format!("only {n_used} of {} samples agree with each other", samples.len()),
                 "check that each robot pose belongs to its image and that neither board nor camera was moved",
@@ -107,23 +107,24 @@ pub(super) fn corner_fit(
     let Selection { input, samples, choice, stage } = selection;
     let used = samples.iter().zip(choice).zip(&stage.is_inlier).filter(|(_, is_inlier)| **is_inlier);
     let chain = input.chain.filter(|_| free.joints);
-    let views: Vec<View> = used
-        .map(|((sample, choice), _)| {
-            let given = &input.samples[sample.sample_ix];
-            let joints = chain.and(given.joints.clone()).unwrap_or_default();
-            View { base_from_flange: given.base_from_flange, points: corners(input, sample, *choice), joints }
-        })
-        .collect();
+    let mut by_stop = std::collections::BTreeMap::<usize, Vec<View>>::new();
+    for ((sample, choice), _) in used {
+        let given = &input.samples[sample.sample_ix];
+        let joints = chain.and(given.joints.clone()).unwrap_or_default();
+        let view = View { base_from_flange: given.base_from_flange, points: corners(input, sample, *choice), joints };
+        by_stop.entry(sample.stop_ix).or_default().push(view);
+    }
+    let stops: Vec<Vec<View>> = by_stop.into_values().collect();
     let problem = CornerProblem {
         setup: input.setup,
-        views: &views,
+        stops: &stops,
         noise: stage.weighting,
         n_intrinsics: if free.intrinsics { intrinsics.params().len() } else { 0 },
         chain,
     };
     let n_inner = chain.map_or(0, |chain| chain.n_joints().saturating_sub(2));
     let joint_offsets = if offsets.len() == n_inner { offsets.to_vec() } else { vec![0.0; n_inner] };
-    let pose_errors = vec![Vector6::zeros(); views.len()];
+    let pose_errors = vec![Vector6::zeros(); stops.len()];
     problem.minimize(CornerState {
         solution: stage.fit.solution,
         intrinsics: intrinsics.clone(),
@@ -144,6 +145,8 @@ pub(super) fn corner_noise(samples: &[Sample], choice: &[usize], is_inlier: &[bo
     Some((squares / f64::max(n_free, 1.0)).sqrt().max(MIN_PX))
 }
 
+/// The selected measurements, weighted such that each stop counts once.
 pub(super) fn select(measurements: &[Measurement], is_inlier: &[bool]) -> Vec<Measurement> {
-    measurements.iter().zip(is_inlier).filter(|(_, is_inlier)| **is_inlier).map(|(m, _)| m.clone()).collect()
+    let selected = measurements.iter().zip(is_inlier).filter(|(_, is_inlier)| **is_inlier);
+    pose_fit::with_weights(selected.map(|(measurement, _)| measurement.clone()).collect())
 }

@@ -426,3 +426,66 @@ fn recorded_board_scatters_less_than_with_closed_forms() {
     let held_out = found.held_out_scatter.unwrap();
     assert!(held_out.mm < OPENCV.mm && held_out.deg < OPENCV.deg, "{held_out:?}");
 }
+
+#[test]
+fn identical_samples_count_once() {
+    let scene = Scene::new(Setup::EyeInHand, 6, 0.4, 8);
+    let robot = Errors { corner_px: 0.2, board_rad: 2e-3, board_m: 1e-3, robot_rad: 5e-4, robot_m: 5e-4 };
+    for samples in [scene.views(&robot, 3), scene.poses(&robot, 3)] {
+        let once = calibrate_hand_eye(&scene.input(samples.clone())).unwrap();
+        let often = calibrate_hand_eye(&scene.input([samples.clone(), samples.clone(), samples].concat())).unwrap();
+        assert_eq!(once.sigma_mm, often.sigma_mm);
+        assert_eq!(once.parent_from_camera, often.parent_from_camera);
+        assert_eq!(once.held_out_scatter, often.held_out_scatter);
+        let repeated = often.samples.iter().filter(|sample| sample.status == SampleStatus::Repeated);
+        assert_eq!(repeated.count(), 12);
+        assert!(often.warnings.iter().any(|warning| warning.starts_with("12 samples are identical")), "{often:?}");
+    }
+}
+
+#[test]
+fn several_images_at_one_stop_do_not_count_as_independent() {
+    let robot = Errors { corner_px: 0.05, robot_rad: 1e-3, robot_m: 1e-3, ..Errors::default() };
+    let n_covered = (0..N_RUNS).filter(|seed| {
+        let scene = Scene::new(Setup::EyeInHand, 8, 0.4, 200 + seed);
+        let stops = scene.views(&robot, *seed);
+        let mut random = Random::new(*seed);
+        let mut samples = Vec::new();
+        for stop in &stops {
+            // The robot's error is that of the stop; each image has its own noise.
+            for ix in 0..5 {
+                let mut sample = HandEyeSample { name: format!("{} {ix}", stop.name), ..stop.clone() };
+                if let BoardObservation::View(view) = &mut sample.board {
+                    let pixels = view.points.iter_mut().flat_map(|point| &mut point.pixel);
+                    pixels.for_each(|value| *value += 0.1 * random.normal());
+                }
+                samples.push(sample);
+            }
+        }
+        let found = calibrate_hand_eye(&scene.input(samples)).unwrap();
+        assert!(found.warnings.iter().any(|warning| warning.starts_with("40 samples were taken at 8 different")));
+        squared_error(&found, &scene.parent_from_camera) < 12.59
+    });
+    let n_covered = n_covered.count() as u64;
+    assert!((24..=N_RUNS).contains(&n_covered), "{n_covered} of {N_RUNS}");
+}
+
+#[test]
+fn reversed_lists_and_units_are_named() {
+    let scene = Scene::new(Setup::EyeInHand, 12, 0.4, 9);
+    let samples = scene.poses(&Errors { board_rad: 1e-3, board_m: 5e-4, ..Errors::default() }, 3);
+    let mut reversed = samples.clone();
+    for (sample, other) in reversed.iter_mut().zip(samples.iter().rev()) {
+        sample.board = other.board.clone();
+    }
+    let refused = refusal(&scene.input(reversed));
+    assert!(!refused.motion.starts_with("add poses"), "{refused}");
+    for (unit, per_m) in [("millimeters", 1000.0), ("centimeters", 100.0), ("inches", 39.37)] {
+        let mut scaled = samples.clone();
+        for sample in &mut scaled {
+            sample.base_from_flange.translation.vector *= per_m;
+        }
+        let refused = refusal(&scene.input(scaled));
+        assert!(refused.why.contains(unit), "{refused}");
+    }
+}

@@ -39,10 +39,21 @@ pub(super) fn correlate(a: &Stream, b: &Stream, max_offset_secs: Option<f64>) ->
     }
     let correlations = grid.correlations(max_offset_secs);
     let Some(best) = correlations.iter().max_by(|p, q| p.significance.total_cmp(&q.significance)) else {
-        return Err(Refusal::new(
-            "the streams do not overlap in the allowed range of offsets",
-            "record both streams at the same time, or allow a larger offset",
-        ));
+        let most = max_offset_secs.unwrap_or(f64::INFINITY);
+        let nearest = grid
+            .correlations(None)
+            .iter()
+            .map(|at| grid.offset_secs(at.lag))
+            .min_by(|p, q| p.abs().total_cmp(&q.abs()));
+        return Err(match nearest {
+            Some(nearest) => Refusal::new(
+                format!(
+                    "at offsets of at most {most} s, the streams do not overlap long enough; the smallest offset at which they do is {nearest:.3} s"
+                ),
+                "search larger offsets, or check the stamps",
+            ),
+            None => Refusal::new("the streams do not overlap long enough", "record both streams at the same time"),
+        });
     };
     if best.value < MIN_CORRELATION {
         if let Some(refusal) = clock_rate_mistake(a, b) {
@@ -108,7 +119,7 @@ impl Grid {
         let [n_a, n_b] = self.rates.each_ref().map(|rates| signed(rates.values.len()));
         let min_overlap = (MIN_OVERLAP * n_a.min(n_b) as f64).max(10.0);
         (-n_b..=n_a)
-            .filter(|lag| max_offset_secs.is_none_or(|most| self.offset_secs(*lag).abs() <= most))
+            .filter(|lag| max_offset_secs.is_none_or(|most| self.offset_secs(*lag).abs() <= most.max(self.step_secs)))
             .filter_map(|lag| Correlation::new(&self.rates[0], &self.rates[1], lag, min_overlap))
             .collect()
     }

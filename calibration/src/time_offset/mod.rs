@@ -6,6 +6,7 @@
 mod coarse;
 mod fine;
 mod profile;
+mod quaternion_order;
 mod stamps;
 mod stream;
 #[cfg(test)]
@@ -108,6 +109,15 @@ pub fn estimate_time_offset(
     b: &[PoseSample],
     options: &TimeOffsetOptions,
 ) -> Result<TimeOffset, Error> {
+    let found = estimate(a, b, options);
+    match quaternion_order::mistake(a, b, options, found.as_ref()) {
+        Some(refusal) => Err(Error::Refused(Box::new(refusal))),
+        None => found,
+    }
+}
+
+/// The estimate for streams as they are given.
+fn estimate(a: &[PoseSample], b: &[PoseSample], options: &TimeOffsetOptions) -> Result<TimeOffset, Error> {
     let refused = |refusal| Error::Refused(Box::new(refusal));
     let (a, b) = (Stream::new("A", a)?, Stream::new("B", b)?);
     let coarse = coarse::correlate(&a, &b, options.max_offset_secs).map_err(refused)?;
@@ -127,6 +137,12 @@ pub fn estimate_time_offset(
                 coarse.offset_secs
             ),
             "check that both streams are poses of the bodies (reference_from_body), not their inverses",
+        )));
+    }
+    if let Some(most) = options.max_offset_secs.filter(|most| offset_secs.abs() > most + coarse.step_secs) {
+        return Err(refused(Refusal::new(
+            format!("the offset is {offset_secs:.3} s, which is more than the largest offset to search ({most} s)"),
+            "search larger offsets",
         )));
     }
     // Written so that NaN is refused.
@@ -173,6 +189,8 @@ fn refine_best(
     const EXACT_RAD: f64 = 1e-4;
     /// Largest residual relative to the motion. Unrelated motions have about 1.
     const MAX_RESIDUAL_FRAC: f64 = 0.25;
+    /// Largest residual per axis of rigidly joined bodies, about 5 degrees.
+    const MAX_RESIDUAL_RAD: f64 = 0.09;
     let mut found: Vec<(coarse::Coarse, fine::Fine)> = Vec::new();
     let mut first_error = None;
     for start in starts {
@@ -188,14 +206,14 @@ fn refine_best(
         let why = || Error::TimeOffsetInput { why: "there is no initial offset".to_owned() };
         return Err(first_error.unwrap_or_else(why));
     };
-    if best.median_rad > MAX_RESIDUAL_FRAC * best.motion_rad {
+    if best.median_rad > (MAX_RESIDUAL_FRAC * best.motion_rad).min(MAX_RESIDUAL_RAD) {
         return Err(refused(
             format!(
                 "after alignment, the orientations still differ by {:.1} degrees of {:.1} degrees of motion",
                 best.median_rad.to_degrees(),
                 best.motion_rad.to_degrees()
             ),
-            "check that both bodies are rigidly joined and recorded at the same time, and that both streams are reference_from_body",
+            "check that both bodies are rigidly joined and recorded at the same time, and that both streams are reference_from_body with the quaternion order x, y, z, w",
         ));
     }
     let is_other = |fine: &fine::Fine| (fine.offset_secs - best.offset_secs).abs() > 5.0 * start.step_secs;

@@ -31,6 +31,27 @@ fn rounded(value: f64) -> String {
     if value < 1e4 { format!("{value:.1}") } else { format!("{value:.3e}") }
 }
 
+/// Describes a single stamp that is far from all others.
+pub(super) fn distant_stamp(name: &str, sorted: &[PoseSample]) -> Option<String> {
+    const MIN_POSES: usize = 4;
+    /// Distance from the other stamps, relative to their range.
+    const MAX_FACTOR: f64 = 1000.0;
+    let n = sorted.len();
+    (n >= MIN_POSES).then_some(())?;
+    let is_distant = |gap: f64, rest: f64| gap > MAX_FACTOR * rest;
+    let secs = |ix: usize| sorted[ix].secs;
+    let (distant, [first, last]) = if is_distant(secs(n - 1) - secs(n - 2), secs(n - 2) - secs(0)) {
+        (secs(n - 1), [secs(0), secs(n - 2)])
+    } else if is_distant(secs(1) - secs(0), secs(n - 1) - secs(1)) {
+        (secs(0), [secs(1), secs(n - 1)])
+    } else {
+        return None;
+    };
+    Some(format!(
+        "stream {name} has a pose with the stamp {distant:e}, but all others are between {first:.3} and {last:.3} s; remove this pose"
+    ))
+}
+
 /// Describes stamps that several different poses share. A few of them are dropped.
 pub(super) fn repeated_stamps(name: &str, sorted: &[PoseSample]) -> Option<String> {
     const MAX_FRAC: f64 = 0.2;

@@ -39,6 +39,9 @@ impl Stream {
             return invalid(why);
         }
         sorted.dedup_by(|later, earlier| later.secs <= earlier.secs);
+        if let Some(why) = stamps::distant_stamp(name, &sorted) {
+            return invalid(why);
+        }
         if sorted.len() < MIN_POSES {
             return invalid(format!(
                 "stream {name} has {} poses with different stamps; at least {MIN_POSES} are needed",

@@ -221,3 +221,33 @@ fn stamps_that_advance_at_another_rate_or_repeat_are_named() {
 fn message(a: &[PoseSample], b: &[PoseSample]) -> String {
     estimate_time_offset(a, b, &TimeOffsetOptions::default()).unwrap_err().to_string()
 }
+
+#[test]
+fn quaternions_in_another_order_are_named() {
+    let (a, b) = streams(5, 0.003, 0.0);
+    let w_first = |samples: &[PoseSample]| -> Vec<PoseSample> {
+        let written = |sample: &PoseSample| {
+            let [x, y, z, w]: [f64; 4] = sample.pose.rotation.coords.into();
+            let mut pose = sample.pose;
+            pose.rotation = nalgebra::UnitQuaternion::from_quaternion(nalgebra::Quaternion::new(z, w, x, y));
+            PoseSample { pose, ..*sample }
+        };
+        samples.iter().map(written).collect()
+    };
+    let options = TimeOffsetOptions::default();
+    for (name, a, b) in [("stream A", w_first(&a), b.clone()), ("stream B", a.clone(), w_first(&b))] {
+        let refused = refusal(estimate_time_offset(&a, &b, &options));
+        assert!(refused.why.starts_with(&format!("the quaternions of {name} are in the order w")), "{refused}");
+    }
+}
+
+#[test]
+fn small_limits_and_single_wrong_stamps_are_named() {
+    let (a, mut b) = streams(6, 0.001, 0.0);
+    let options = TimeOffsetOptions { max_offset_secs: Some(0.001), ..TimeOffsetOptions::default() };
+    let refused = refusal(estimate_time_offset(&a, &b, &options));
+    assert!(!refused.why.contains("overlap"), "{refused}");
+    b[100].secs = 1e308;
+    let error = estimate_time_offset(&a, &b, &TimeOffsetOptions::default()).unwrap_err().to_string();
+    assert!(error.contains("stream B has a pose with the stamp 1e308"), "{error}");
+}

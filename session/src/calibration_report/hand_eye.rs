@@ -71,7 +71,12 @@ impl HandEyeReport<'_> {
         }
         let reasons = self.unused.iter().map(|unused| vec![unused.name.clone(), unused.reason.clone()]);
         page.table("Not used", &["sample", "reason"], reasons.collect());
-        let legend = "Circles: detected corners. Crosses: corners predicted by the result, assuming exact robot poses.";
+        let legend = match self.calibration {
+            Some(_) => {
+                "Circles: detected corners. Crosses: corners predicted by the result, assuming exact robot poses."
+            }
+            None => "Circles: detected corners.",
+        };
         page.section("Images", legend, &page::gallery(&self.pictures()));
         page.finish()
     }
@@ -210,6 +215,7 @@ fn row(report: &SampleReport) -> BarRow {
         SampleStatus::Used => "",
         SampleStatus::Outlier => "outlier",
         SampleStatus::NoBoard => "too few corners",
+        SampleStatus::Repeated => "identical to an earlier sample",
     };
     let values = vec![report.position_mm, report.rotation_deg, report.rms_px];
     BarRow { name: report.name.clone(), tag: tag.to_owned(), values }

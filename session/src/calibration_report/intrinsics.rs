@@ -58,8 +58,16 @@ impl IntrinsicsReport<'_> {
         let columns = [("error, px", 3), ("corners", 0)];
         page.section("Images", legend, &bars::table("image", &columns, &self.rows()));
         page.table("Not used", &["image", "reason"], self.reasons());
-        let legend = "Circles: detected corners. Crosses: corners predicted by the result.";
-        page.section("Worst and median image", legend, &page::gallery(&self.pictures()));
+        let legend = match self.calibration {
+            Some(_) => "Circles: detected corners. Crosses: corners predicted by the result.",
+            None => "Circles: detected corners.",
+        };
+        let title = if self.calibration.is_some() {
+            "Worst and median image"
+        } else {
+            "Images with the fewest and a median number of corners"
+        };
+        page.section(title, legend, &page::gallery(&self.pictures()));
         page.finish()
     }
 

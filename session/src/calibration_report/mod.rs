@@ -48,11 +48,23 @@ pub fn check_target_file(file: &Path) -> Result<(), Error> {
     let folder = file.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
     let is_page = file.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("html"));
     match folder.is_dir() && !file.is_dir() && is_page {
+        true if is_other_file(file) => Err(Error::BadInput(format!(
+            "--report {}: the file exists and is not a report of fieldrig; choose another name",
+            file.display()
+        ))),
         true => Ok(()),
         false => Err(Error::BadInput(format!(
             "--report {}: must be a file with the extension .html in an existing folder",
             file.display()
         ))),
+    }
+}
+
+/// Whether a file exists that is neither empty nor a report.
+fn is_other_file(file: &Path) -> bool {
+    match std::fs::read(file) {
+        Ok(bytes) => !bytes.is_empty() && !String::from_utf8_lossy(&bytes).contains(page::SUBTITLE),
+        Err(_) => false,
     }
 }
 

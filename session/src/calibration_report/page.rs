@@ -7,6 +7,9 @@ use crate::{Table, next_commands, run_folder};
 /// A key figure: name, value, unit.
 pub(super) type Figure = (&'static str, String, &'static str);
 
+/// The beginning of the line below the title. It marks a file as a report.
+pub(super) const SUBTITLE: &str = "<p class=\"sub\">fieldrig ";
+
 /// A page with its sections.
 pub(super) struct Page {
     title: String,
@@ -18,15 +21,14 @@ impl Page {
     ///
     /// * `verdict`: what the result is based on, if there is one.
     pub(super) fn new(title: &str, heading: &Heading, verdict: &str, figures: &[Figure]) -> Self {
-        let subtitle =
-            [format!("fieldrig {}", env!("CARGO_PKG_VERSION")), run_folder::utc_now(), heading.input.clone()];
+        let subtitle = [env!("CARGO_PKG_VERSION").to_owned(), run_folder::utc_now(), heading.input.clone()];
         let (class, head, text) = match &heading.refused {
             Some(reason) => ("refused", "Refused", reason.as_str()),
             None if heading.warnings.is_empty() => ("accepted", "Accepted", verdict),
             None => ("doubtful", "Accepted, with warnings", verdict),
         };
         let mut html = format!(
-            "<h1>{}</h1>\n<p class=\"sub\">{}</p>\n<div class=\"verdict {class}\"><strong>{head}</strong><p>{}</p>{}</div>\n",
+            "<h1>{}</h1>\n{SUBTITLE}{}</p>\n<div class=\"verdict {class}\"><strong>{head}</strong><p>{}</p>{}</div>\n",
             escaped(title),
             escaped(&subtitle.join(" · ")),
             escaped(text),

@@ -128,10 +128,18 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         rig.expect_size(*size_px)?;
     }
     let result = args.calibrate(&detected);
-    if let Some(path) = report {
-        args.write_report(path, &detected, &result)?;
-    }
-    let calibration = result?;
+    // The result is printed even if the report cannot be written.
+    let written = match report {
+        Some(path) => args.write_report(path, &detected, &result),
+        None => Ok(()),
+    };
+    let calibration = match result {
+        Ok(calibration) => calibration,
+        Err(error) => {
+            outputs::log_failure(written);
+            return Err(error);
+        }
+    };
     let printed = printed(&calibration, &detected.unused);
     if args.json {
         print::json(&printed)?
@@ -145,13 +153,14 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         rig.set_intrinsics(&calibration.intrinsics)?;
         rig.write()?;
     }
+    written?;
     Ok(Exit::Done)
 }
 
 impl Args {
     /// Reads the images and detects the target. `output` gets the calibration that devices report.
     fn detect(&self, keeps_photos: bool, output: Option<&mut RigOutput>) -> anyhow::Result<Detected> {
-        let options = ScanOptions { keeps_photos, is_hidden: self.json };
+        let options = ScanOptions { keeps_photos, is_hidden: self.json, needs_arm: false };
         let (images, photos, no_images, warnings) =
             match self.rig.read(&self.input, Some(&self.target), options, output)? {
                 Some(mut scan) => (scan.detected(), scan.take_photos(), scan.no_images, scan.warnings),

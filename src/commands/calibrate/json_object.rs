@@ -56,7 +56,7 @@ impl<'a> JsonObject<'a> {
 
     pub(super) fn text(&self, key: &str) -> Result<Option<&'a str>, BadArgument> {
         let text = |value: &'a Value| {
-            value.as_str().ok_or_else(|| self.invalid(key, format!("{}, expected a text", kind_of(value))))
+            value.as_str().ok_or_else(|| self.invalid(key, format!("{}, expected a string", kind_of(value))))
         };
         self.get(key).map(text).transpose()
     }
@@ -64,10 +64,10 @@ impl<'a> JsonObject<'a> {
     pub(super) fn numbers(&self, key: &str) -> Result<Option<Vec<f64>>, BadArgument> {
         let Some(value) = self.get(key) else { return Ok(None) };
         let Some(list) = value.as_array() else {
-            return Err(self.invalid(key, format!("{}, expected a list of numbers", kind_of(value))));
+            return Err(self.invalid(key, format!("{}, expected an array of numbers", kind_of(value))));
         };
         let numbers: Option<Vec<f64>> = list.iter().map(Value::as_f64).collect();
-        numbers.map(Some).ok_or_else(|| self.invalid(key, "expected a list of numbers"))
+        numbers.map(Some).ok_or_else(|| self.invalid(key, "expected an array of numbers"))
     }
 
     pub(super) fn array<const N: usize>(&self, key: &str) -> Result<Option<[f64; N]>, BadArgument> {
@@ -82,7 +82,8 @@ impl<'a> JsonObject<'a> {
 
     pub(super) fn list(&self, key: &str) -> Result<&'a [Value], BadArgument> {
         let value = self.required(key, self.get(key))?;
-        let list = value.as_array().ok_or_else(|| self.invalid(key, format!("{}, expected a list", kind_of(value))))?;
+        let list =
+            value.as_array().ok_or_else(|| self.invalid(key, format!("{}, expected an array", kind_of(value))))?;
         Ok(list)
     }
 
@@ -102,10 +103,10 @@ impl<'a> JsonObject<'a> {
 fn kind_of(value: &Value) -> &'static str {
     match value {
         Value::Null => "null",
-        Value::Bool(_) => "a truth value",
+        Value::Bool(_) => "a boolean",
         Value::Number(_) => "a number",
-        Value::String(_) => "a text",
-        Value::Array(_) => "a list",
+        Value::String(_) => "a string",
+        Value::Array(_) => "an array",
         Value::Object(_) => "an object",
     }
 }
@@ -125,7 +126,7 @@ mod tests {
         let file = JsonObject::new("s.json", String::new(), &value, &["samples"]).expect("an object");
         let known = ["base_from_flange", "image", "joints"];
         let samples = file.objects("samples", &known).expect("objects");
-        assert_eq!(error(samples[1].text("image")), "s.json: samples[1].image: a number, expected a text");
+        assert_eq!(error(samples[1].text("image")), "s.json: samples[1].image: a number, expected a string");
         assert!(error(samples[1].numbers("joints")).starts_with("s.json: samples[1].joints: expected"));
         assert!(
             error(samples[1].transform("base_from_flange")).contains("samples[1].base_from_flange: must be a matrix")
@@ -142,7 +143,7 @@ mod tests {
         assert_eq!(message, "s.json: unknown key \"zzz\"; the keys are samples, setup");
         assert_eq!(
             error(JsonObject::new("s.json", String::new(), &json!([]), &[])),
-            "s.json: a list, expected an object"
+            "s.json: an array, expected an object"
         );
     }
 }

@@ -85,6 +85,9 @@ impl RigFlags {
     pub(super) fn open(&self, input: &Path) -> anyhow::Result<Option<RigOutput>> {
         self.check(input)?;
         let Some(file) = &self.write_rig else { return Ok(None) };
+        if !is_rig_file(file) {
+            return Err(BadArgument(format!("--write-rig {}: must have the extension .toml", file.display())).into());
+        }
         let rig = match (InputKind::of(input), &self.rig) {
             (InputKind::Recording, rig) => {
                 session::expect(input)?;
@@ -167,7 +170,7 @@ impl RigOutput {
             given.params().len() != used.params().len() || pairs.into_iter().any(|(a, b)| (a - b).abs() > MAX_PX);
         if differ {
             log::warn!(
-                "the pose of camera {:?} was estimated with other intrinsics than those of the rig file; write them with calibrate intrinsics --write-rig, too",
+                "the pose of camera {:?} was estimated with other intrinsics than those of the rig file, which are kept; update them with `fieldrig calibrate intrinsics --write-rig`",
                 self.camera
             );
         }
@@ -211,6 +214,13 @@ pub(super) fn write_report(file: &Path, html: &str) -> anyhow::Result<()> {
     calibration_report::write(file, html)?;
     log::info!("report written to {}", file.display());
     Ok(())
+}
+
+/// Logs why a report was not written, if another error is returned.
+pub(super) fn log_failure(written: anyhow::Result<()>) {
+    if let Err(error) = written {
+        log::error!("{error:#}");
+    }
 }
 
 /// The heading of the report on a result. `None` for errors that are not a refusal: they have no report.

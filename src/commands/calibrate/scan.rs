@@ -7,7 +7,7 @@ use crate::exit::{BadArgument, InsufficientData};
 use crate::{print, signals};
 use calibration::BoardView;
 use calibration::hand_eye::{BoardObservation, FlangeMotion, HandEyeSample, Setup, corners_at_mid_exposure};
-use capture::config::{Camera, Override, Parent, Rig};
+use capture::config::{ArmDriver, Camera, Override, Parent, Rig};
 use capture::open::{self, Devices, Opened};
 use capture::{ArmDuringImage, CalibrationImage, CalibrationImages, calibration_images};
 use drivers::Sample;
@@ -45,6 +45,8 @@ pub(super) struct ScanOptions {
     pub(super) keeps_photos: bool,
     /// No progress bars.
     pub(super) is_hidden: bool,
+    /// Rejects rigs without an arm.
+    pub(super) needs_arm: bool,
 }
 
 impl RigFlags {
@@ -65,8 +67,12 @@ impl RigFlags {
         }
         session::expect(input)?;
         let Some(target) = target else {
-            let example = "such as charuco:5x7:34mm:26mm:5X5_100";
-            return Err(BadArgument(format!("{}: --target is missing, {example}", input.display())).into());
+            let example = "for example --target charuco:5x7:34mm:26mm:5X5_100";
+            return Err(BadArgument(format!(
+                "{}: --target is required with a recording or rig file, {example}",
+                input.display()
+            ))
+            .into());
         };
         let opened = match kind {
             InputKind::Rig => self.open_devices(input)?,
@@ -76,6 +82,13 @@ impl RigFlags {
             }
         };
         let rig = opened.rig.clone();
+        if options.needs_arm && rig.arm.driver == ArmDriver::None {
+            return Err(BadArgument(format!(
+                "{}: the rig has no arm, which hand-eye calibration needs; without an arm, use `fieldrig calibrate intrinsics`",
+                input.display()
+            ))
+            .into());
+        }
         if let Some(output) = output.filter(|_| kind == InputKind::Rig && !self.sim) {
             output.set_rig(&rig);
         }
@@ -92,7 +105,7 @@ impl RigFlags {
             found.n_fast,
             found.n_unusable
         );
-        let no_images = found.images.is_empty().then(|| no_images(input, &camera, &found));
+        let no_images = found.images.is_empty().then(|| no_images(input, &rig, &camera, &found));
         let scan = Scan::detect(rig, camera, found, target, options)?;
         Ok(Some(Scan { no_images, warnings, ..scan }))
     }
@@ -119,11 +132,20 @@ impl RigFlags {
     }
 }
 
-fn no_images(input: &Path, camera: &Camera, found: &CalibrationImages) -> String {
+fn no_images(input: &Path, rig: &Rig, camera: &Camera, found: &CalibrationImages) -> String {
     let (input, name) = (input.display(), &camera.name);
     match (found.n_read, found.n_fast) {
-        (0, _) => format!("{input}: no image of camera {name:?}"),
-        (_, 0) => format!("{input}: camera {name:?}: no joint readings at the stamps of {} images", found.n_read),
+        (0, _) => {
+            let names: Vec<&str> = rig.cameras.iter().map(|camera| &*camera.name).collect();
+            let names = keyframe::listed(&names, "and");
+            format!(
+                "{input}: no image of camera {name:?}; the cameras of the rig are {names}: choose one with --camera"
+            )
+        }
+        (_, 0) => format!(
+            "{input}: camera {name:?}: none of {} images can be decoded and has joint readings at its stamp; check the clocks of arm and camera, and join.max_gap_millis",
+            found.n_read
+        ),
         (_, n) => format!(
             "{input}: camera {name:?}: the arm moves too fast in {n} images (more than {MAX_SHIFT_PX} px); stop it at each pose"
         ),

@@ -43,6 +43,8 @@ struct Printed {
     /// Seconds to add to the clock of B to get that of A.
     offset_secs: Option<f64>,
     sigma_secs: Option<f64>,
+    /// RMS difference of the orientations after alignment, degrees.
+    residual_deg: Option<f64>,
     /// Rate of the clock of A relative to that of B, minus 1, in parts per million; null if it is not significant.
     drift_ppm: Option<f64>,
     drift_sigma_ppm: Option<f64>,
@@ -68,9 +70,10 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let options =
         TimeOffsetOptions { hand_eye: args.hand_eye, max_offset_secs: args.max_offset, ..TimeOffsetOptions::default() };
     let result = estimate_time_offset(&a, &b, &options).map_err(anyhow::Error::from);
-    if let Some(path) = report {
-        args.write_report(path, motion_profile(&a, &b, &options).ok().as_ref(), &result)?;
-    }
+    let written = match report {
+        Some(path) => args.write_report(path, motion_profile(&a, &b, &options).ok().as_ref(), &result),
+        None => Ok(()),
+    };
     let printed = match result {
         Ok(offset) => Printed::of(&offset),
         Err(error) if exit::of(&error) == Exit::InsufficientData => {
@@ -84,6 +87,8 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     } else {
         describe(&printed)?
     }
+    // The result is printed even if the report cannot be written.
+    written?;
     match refused {
         None => Ok(Exit::Done),
         Some(_) if args.json => Ok(Exit::InsufficientData),
@@ -116,6 +121,7 @@ impl Printed {
         Self {
             offset_secs: Some(offset.offset_secs),
             sigma_secs: Some(offset.sigma_secs),
+            residual_deg: Some(offset.rms_deg),
             drift_ppm: offset.drift_ppm.map(|[drift, _]| drift),
             drift_sigma_ppm: offset.drift_ppm.map(|[_, sigma]| sigma),
             mid_secs: Some(offset.mid_secs),
@@ -164,6 +170,9 @@ fn read(path: &Path) -> anyhow::Result<Vec<PoseSample>> {
 fn describe(printed: &Printed) -> anyhow::Result<()> {
     let (Some(offset), Some(sigma)) = (printed.offset_secs, printed.sigma_secs) else { return Ok(()) };
     print::line(format!("add {offset:.6} +- {sigma:.6} s to the clock of B to get that of A"))?;
+    if let Some(residual) = printed.residual_deg {
+        print::line(format!("residual: {residual:.3} degrees (RMS difference of the orientations after alignment)"))?;
+    }
     if let (Some(drift), Some(sigma)) = (printed.drift_ppm, printed.drift_sigma_ppm) {
         print::line(format!("drift: {drift:.1} +- {sigma:.1} ppm"))?;
     }

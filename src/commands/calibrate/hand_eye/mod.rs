@@ -92,9 +92,11 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         rig.expect_size(size_px)?;
     }
     let result = args.calibrate(&source, &samples).map_err(|error| with_reason(error, &source, &samples));
-    if let Some(path) = report {
-        write_report(path, &args.input, &source, &samples, &result)?;
-    }
+    // The result is printed even if the report cannot be written.
+    let written = match report {
+        Some(path) => write_report(path, &args.input, &source, &samples, &result),
+        None => Ok(()),
+    };
     let mut printed = match &result {
         Ok(calibrated) => Printed {
             next_poses: calibrated.next_poses.iter().cloned().map(PrintedPose::of).collect(),
@@ -103,7 +105,10 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         Err(error) if exit::of(error) == Exit::InsufficientData && args.json => {
             Printed::refused(source.setup(), format!("{error:#}"))
         }
-        Err(_) => return result.map(|_| Exit::Done),
+        Err(_) => {
+            outputs::log_failure(written);
+            return result.map(|_| Exit::Done);
+        }
     };
     printed.samples.extend(samples.unused.iter().map(PrintedSample::unused));
     if args.json {
@@ -111,7 +116,10 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     } else {
         printed::describe(&printed, result.as_ref().ok().map(|found| &found.rig_pose))?
     }
-    let Ok(Calibrated { calibration, intrinsics, .. }) = result else { return Ok(Exit::InsufficientData) };
+    let Ok(Calibrated { calibration, intrinsics, .. }) = result else {
+        outputs::log_failure(written);
+        return Ok(Exit::InsufficientData);
+    };
     if let Some(rig) = &mut rig {
         rig.set_extrinsics(calibration.setup, &calibration.parent_from_camera)?;
         match (&calibration.intrinsics, intrinsics) {
@@ -128,6 +136,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         }
         rig.write()?;
     }
+    written?;
     Ok(Exit::Done)
 }
 
@@ -175,7 +184,7 @@ fn write_report(
 impl Args {
     /// Reads the samples file, or the images of a recording or rig. `output` gets the calibration that devices report.
     fn source(&self, keeps_photos: bool, output: Option<&mut RigOutput>) -> anyhow::Result<Source> {
-        let options = ScanOptions { keeps_photos, is_hidden: self.json };
+        let options = ScanOptions { keeps_photos, is_hidden: self.json, needs_arm: true };
         let scan = self.rig.read(&self.input, self.target.as_ref(), options, output)?;
         let has = |what: &str, flag: &str| BadArgument(format!("{flag}: {}; remove the flag", what));
         match (scan, &self.target) {

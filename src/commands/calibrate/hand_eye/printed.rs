@@ -116,6 +116,7 @@ pub(super) fn printed(calibration: &HandEyeCalibration) -> Printed {
                     SampleStatus::Used => "used",
                     SampleStatus::Outlier => "outlier",
                     SampleStatus::NoBoard => "no-board",
+                    SampleStatus::Repeated => "repeated",
                 },
                 position_mm: sample.position_mm,
                 rotation_deg: sample.rotation_deg,

@@ -6,7 +6,7 @@ use super::super::lens::LensFile;
 use super::super::{outputs, target_argument};
 use crate::exit::{BadArgument, InsufficientData};
 use calibration::hand_eye::{BoardObservation, HandEyeSample, Setup};
-use kinematics::Transform;
+use kinematics::{Intrinsics, Transform};
 use serde_json::Value;
 use session::calibration_report::{Photos, Unused};
 use std::path::{Path, PathBuf};
@@ -16,7 +16,7 @@ use targets::TargetSpec;
 #[derive(Debug)]
 pub(super) struct SamplesFile {
     path: PathBuf,
-    pub(super) intrinsics: Option<LensFile>,
+    intrinsics: Option<LensFile>,
     pub(super) target: Option<TargetSpec>,
     pub(super) setup: Setup,
     entries: Vec<Entry>,
@@ -53,7 +53,8 @@ impl SamplesFile {
     pub(super) fn read(path: &Path) -> Result<Self, BadArgument> {
         let name = path.display().to_string();
         let text = outputs::read_text(path)?;
-        let value: Value = serde_json::from_str(&text).map_err(|error| BadArgument(format!("{name}: {error}")))?;
+        let value: Value = serde_json::from_str(&text)
+            .map_err(|error| BadArgument(format!("{name}: {error}{}", not_json_hint(&text))))?;
         let file = JsonObject::new(&name, String::new(), &value, &FILE_KEYS)?;
         let intrinsics = file.object("intrinsics", &LensFile::KEYS)?;
         let target = file.text("target")?.map(target_argument).transpose();
@@ -77,12 +78,24 @@ impl SamplesFile {
             entries: samples.iter().map(|sample| Entry::read(sample, folder)).collect::<Result<_, _>>()?,
         };
         if read.has_images() && read.target.is_none() {
-            return Err(file.invalid("target", "missing; samples with images need it"));
+            return Err(file.invalid(
+                "target",
+                "missing; samples with images need it, for example \"charuco:5x7:34mm:26mm:5X5_100\"",
+            ));
         }
         if read.has_images() && read.intrinsics.is_none() {
-            return Err(file.invalid("intrinsics", "missing; samples with images need them"));
+            return Err(file.invalid(
+                "intrinsics",
+                "missing; samples with images need them: {\"focal_px\": [fx, fy], \"principal_px\": [cx, cy]}",
+            ));
         }
         Ok(read)
+    }
+
+    /// The given intrinsics, for images of this size.
+    pub(super) fn intrinsics(&self, size_px: [u32; 2]) -> Result<Option<Intrinsics>, BadArgument> {
+        let of_file = |error: BadArgument| BadArgument(format!("{}: {error}", self.path.display()));
+        self.intrinsics.as_ref().map(|lens| lens.intrinsics(size_px).map_err(of_file)).transpose()
     }
 
     fn has_images(&self) -> bool {
@@ -132,6 +145,16 @@ impl SamplesFile {
             true => Err(InsufficientData(format!("{}: no image shows the target", self.path.display()))),
             false => Ok(()),
         }
+    }
+}
+
+/// A hint at numbers that other programs write but JSON does not have.
+fn not_json_hint(text: &str) -> &'static str {
+    let has = |word: &str| text.split(|c: char| !c.is_ascii_alphabetic()).any(|found| found == word);
+    if ["NaN", "nan", "Infinity", "inf"].into_iter().any(has) {
+        "; NaN and infinity are not JSON: remove the samples that contain them"
+    } else {
+        ""
     }
 }
 

@@ -51,9 +51,7 @@ impl Source {
     pub(super) fn intrinsics(&self, size_px: Option<[u32; 2]>) -> anyhow::Result<Option<Intrinsics>> {
         match (self, size_px) {
             (Self::Scan { scan, .. }, _) => Ok(Some(scan.intrinsics().clone())),
-            (Self::File(file), Some(size_px)) => {
-                Ok(file.intrinsics.as_ref().map(|lens| lens.intrinsics(size_px)).transpose()?)
-            }
+            (Self::File(file), Some(size_px)) => Ok(file.intrinsics(size_px)?),
             (Self::File(_), None) => Ok(None),
         }
     }
