@@ -5,7 +5,6 @@ use super::consensus::{self, Consensus};
 use super::geometry;
 use super::refine::Refined;
 use super::refusal::Refusal;
-use super::report::HandEyeCalibration;
 use super::samples::{self, Sample};
 use super::{BoardObservation, HandEyeInput, HandEyeSample, Setup};
 use kinematics::Transform;
@@ -120,14 +119,13 @@ pub(super) fn unit_mistake(input: &HandEyeInput<'_>) -> Option<Refusal> {
     Some(Refusal::new(why, remedy))
 }
 
-/// Samples that contradict each other, which more samples do not change.
-pub(super) fn contradiction(refined: &Refined, calibration: &HandEyeCalibration) -> Option<Refusal> {
+/// Samples that contradict each other, which more samples do not change. `scatter_mm` is the scatter of the board.
+pub(super) fn contradiction(refined: &Refined, scatter_mm: f64) -> Option<Refusal> {
     /// Scatter of the board relative to its distance. Detections and robots are far more accurate.
     const MAX_FRAC: f64 = 0.05;
     let distances: Vec<f64> =
         refined.measurements().iter().map(|found| found.camera_from_board.translation.vector.norm()).collect();
     let distance_m = kinematics::quantile::median(&distances)?;
-    let scatter_mm = calibration.scatter.mm;
     (scatter_mm > 1e3 * MAX_FRAC * distance_m).then(|| {
         Refusal::new(
             format!(

@@ -195,7 +195,7 @@ pub fn calibrate_hand_eye(input: &HandEyeInput<'_>) -> Result<HandEyeCalibration
     )
     .map_err(|refusal| {
         let doubt = refined.intrinsics_doubt.as_deref();
-        if let Some(refusal) = mistakes::contradiction(&refined, &calibration).filter(|_| doubt.is_none()) {
+        if let Some(refusal) = mistakes::contradiction(&refined, calibration.scatter.mm).filter(|_| doubt.is_none()) {
             return refused(refusal);
         }
         refused(with_doubt(refusal.with_warnings(&calibration.warnings, doubt), doubt))

@@ -505,12 +505,13 @@ impl FieldTrainer {
                 if stride > 1 {
                     picture_passes.keep_fronts(list, canvas);
                 }
-                list.copy((&samples.batch, 4), (&canvas.progress, 8 * n_batches), 4);
-                list.copy((&canvas.selected, 8), (&canvas.progress, 8 * n_batches + 4), 4);
+                let at = 8 * n_batches as u64;
+                list.copy((&samples.batch, 4), (&canvas.progress, at), 4);
+                list.copy((&canvas.selected, 8), (&canvas.progress, at + 4), 4);
                 n_batches += 1;
                 list.submit(gpu); // The next batch overwrites the parameters of this one.
             }
-            let progress = gpu.read::<[u32; 2]>(&canvas.progress, n_batches as usize)?;
+            let progress = gpu.read::<[u32; 2]>(&canvas.progress, n_batches)?;
             let needed = progress.iter().map(|[_, n_rounds]| *n_rounds).max().unwrap_or(0);
             let is_complete = progress.iter().all(|[n_samples, _]| *n_samples == 0) || *picture_rounds >= MAX_ROUNDS;
             // Some more rounds for the next picture: without samples, they take little time.

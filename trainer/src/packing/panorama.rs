@@ -81,7 +81,7 @@ impl Face {
     }
 }
 
-/// `Face` of panorama_face.wgsl.
+/// `Face` of `panorama_face.wgsl`.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
 struct FaceParams {
