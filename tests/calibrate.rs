@@ -1,10 +1,12 @@
 //! `fieldrig calibrate`, from files to the printed result.
 
+mod command;
+
+use command::{fieldrig, json_of, stderr};
 use kinematics::{Intrinsics, Lens, Transform, transform};
 use nalgebra::{UnitQuaternion, Vector3};
 use serde_json::{Value, json};
 use std::path::Path;
-use std::process::{Command, Output};
 use targets::TargetSpec;
 use targets::synthetic::{View, render};
 
@@ -14,19 +16,6 @@ const SIZE_PX: [u32; 2] = [480, 360];
 const DONE: i32 = 0;
 const BAD_ARGUMENTS: i32 = 2;
 const INSUFFICIENT_DATA: i32 = 4;
-
-fn fieldrig(folder: &Path, args: &[&str]) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_fieldrig")).args(args).current_dir(folder).output().expect("fieldrig starts")
-}
-
-fn json_of(output: &Output) -> Value {
-    let text = String::from_utf8_lossy(&output.stdout);
-    serde_json::from_str(&text).unwrap_or_else(|error| panic!("{error}: {text}{}", stderr(output)))
-}
-
-fn stderr(output: &Output) -> String {
-    String::from_utf8_lossy(&output.stderr).into_owned()
-}
 
 fn camera() -> Intrinsics {
     Intrinsics {

@@ -1,26 +1,15 @@
 //! `fieldrig calibrate intrinsics` and `hand-eye` from a simulated scan of a printed target, against the truth.
 #![cfg(feature = "sim")]
 
+mod command;
+
+use command::{fieldrig, json_of, stderr};
 use kinematics::{Transform, transform};
 use nalgebra::{Quaternion, UnitQuaternion, Vector3};
 use serde_json::Value;
 use std::path::Path;
-use std::process::{Command, Output};
 
 const TARGET: &str = "charuco:5x7:24mm:18mm:5X5_100";
-
-fn fieldrig(folder: &Path, args: &[&str]) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_fieldrig")).args(args).current_dir(folder).output().expect("fieldrig starts")
-}
-
-fn json_of(output: &Output) -> Value {
-    let text = String::from_utf8_lossy(&output.stdout);
-    serde_json::from_str(&text).unwrap_or_else(|error| panic!("{error}: {text}{}", stderr(output)))
-}
-
-fn stderr(output: &Output) -> String {
-    String::from_utf8_lossy(&output.stderr).into_owned()
-}
 
 fn numbers(value: &Value) -> Vec<f64> {
     let inner = |values: &Vec<Value>| values.iter().flat_map(numbers).collect();

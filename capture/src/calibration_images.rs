@@ -6,6 +6,7 @@
 use crate::config::{ArmDriver, Camera, Rig};
 use crate::open::{Opened, chain_of};
 use drivers::{Image, Sample};
+use image::{DynamicImage, RgbImage};
 use keyframe::bail;
 use kinematics::{Chain, HistoryError, JointHistory, JointState, Stamp, Transform, transform};
 use std::collections::VecDeque;
@@ -201,11 +202,13 @@ impl<'a> Reader<'a> {
             self.found.n_fast += 1;
             return;
         }
-        let Ok(rgb) = image.decode_rgb() else {
+        let [width, height] = image.size_px;
+        let rgb = image.decode_rgb().ok().and_then(|rgb| RgbImage::from_raw(width, height, rgb));
+        let Some(rgb) = rgb else {
             self.found.n_unusable += 1;
             return;
         };
-        let gray = rgb.chunks_exact(3).map(luma).collect();
+        let gray = DynamicImage::from(rgb).into_luma8().into_raw();
         self.found.images.push(CalibrationImage { secs, size_px: image.size_px, gray, arm });
     }
 
@@ -263,11 +266,4 @@ impl Arm {
             let _ = self.joints.push(JointState { stamp: state.stamp, position, velocity, effort: Vec::new() });
         }
     }
-}
-
-/// Luma of an sRGB pixel (ITU-R BT.601).
-#[expect(clippy::cast_possible_truncation, reason = "a weighted mean of bytes")]
-fn luma(rgb: &[u8]) -> u8 {
-    let sum = 299 * u32::from(rgb[0]) + 587 * u32::from(rgb[1]) + 114 * u32::from(rgb[2]);
-    ((sum + 500) / 1000) as u8
 }

@@ -103,11 +103,8 @@ fn check_names(robot: &Robot, names: &[String]) -> anyhow::Result<()> {
         ensure!(!names[..at].contains(name), "joint {name:?} is listed twice in joint_names");
         if robot.joint(name).is_none() {
             let moving = robot.joints().iter().filter(|joint| joint.kind != JointKind::Fixed);
-            let nearest = moving.max_by(|a, b| {
-                let similarity = |joint: &str| strsim::jaro_winkler(joint, name);
-                similarity(&a.name).total_cmp(&similarity(&b.name))
-            });
-            let hint = nearest.map(|joint| format!("; did you mean {:?}?", joint.name)).unwrap_or_default();
+            let nearest = capture::nearest_name(name, moving.map(|joint| joint.name.as_str()));
+            let hint = nearest.map(|joint| format!("; did you mean {joint:?}?")).unwrap_or_default();
             bail!("joint {name:?} is not in the URDF{hint}");
         }
     }

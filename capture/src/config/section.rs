@@ -3,14 +3,12 @@
 //! Problems are collected, so that a misspelled key is reported as such and not as a missing key.
 
 use super::error::{ConfigError, SourceLocation};
+use crate::nearest_name;
 use std::borrow::Cow;
 use std::cell::RefCell;
 use std::collections::{BTreeMap, BTreeSet};
 use toml::de::{DeTable, DeValue};
 use toml::{Table, Value};
-
-/// Keys that are less similar than this (Jaro-Winkler) are not suggested for an unknown key.
-const MIN_SIMILARITY: f64 = 0.75;
 
 /// State shared by all sections while a rig file is read.
 #[derive(Debug)]
@@ -127,9 +125,7 @@ impl<'a> Section<'a> {
     /// Ends the section and reports unread keys as unknown.
     pub(super) fn end(self) {
         for key in self.table.keys() {
-            let close = |known: &&&str| (strsim::jaro_winkler(key, known) * 1000.0).round();
-            let nearest = self.known.iter().max_by(|a, b| close(a).total_cmp(&close(b)));
-            let nearest = nearest.filter(|known| strsim::jaro_winkler(key, known) > MIN_SIMILARITY);
+            let nearest = nearest_name(key, self.known.iter().copied());
             let path = join(&self.path, key);
             self.context.report(ConfigError::UnknownKey {
                 at: self.context.location(&path),

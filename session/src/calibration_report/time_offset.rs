@@ -34,7 +34,7 @@ impl TimeOffsetReport<'_> {
         if let Some(profile) = self.profile {
             let legend = "Correlation of the rotation rates at each offset. One high, narrow peak determines the offset; several peaks of equal height mean that the motion repeats.";
             page.section("Correlation", legend, &correlation(profile, self.offset));
-            let legend = "The rotation rate of rigidly joined bodies is the same, so the curves must coincide after the correction. Rates above the 95 % quantile of a stream are clipped, as in the correlation, so that single wrong poses do not dominate. Shown are the 15 seconds with the most motion.";
+            let legend = "The rotation rate of rigidly joined bodies is the same, so the curves of A (blue) and B (orange) must coincide after the correction. Rates above the 95 % quantile of a stream are clipped, as in the correlation, so that single wrong poses do not dominate. Shown are the 15 seconds with the most motion.";
             page.section("Rotation rates", legend, &self.rates(profile));
         }
         if let Some(offset) = self.offset {

@@ -14,9 +14,6 @@ pub(super) struct JsonObject<'a> {
     map: &'a Map<String, Value>,
 }
 
-/// A key that is less similar to a known one is not a misspelling of it.
-const MIN_SIMILARITY: f64 = 0.75;
-
 impl<'a> JsonObject<'a> {
     /// Rejects other values, and keys other than `known`.
     pub(super) fn new(file: &'a str, path: String, value: &'a Value, known: &[&str]) -> Result<Self, BadArgument> {
@@ -25,9 +22,7 @@ impl<'a> JsonObject<'a> {
             return Err(BadArgument(format!("{place}: {}, expected an object", kind_of(value))));
         };
         if let Some(unknown) = map.keys().find(|key| !known.contains(&key.as_str())) {
-            let similarity = |key: &str| strsim::jaro_winkler(key, unknown);
-            let nearest = known.iter().copied().max_by(|a, b| similarity(a).total_cmp(&similarity(b)));
-            let hint = match nearest.filter(|key| similarity(key) >= MIN_SIMILARITY) {
+            let hint = match capture::nearest_name(unknown, known.iter().copied()) {
                 Some(key) => format!("did you mean {key:?}?"),
                 None => format!("the keys are {}", known.join(", ")),
             };

@@ -289,50 +289,42 @@ impl FieldPasses<'_> {
         list.dispatch(gpu, &pipelines.find_samples, groups(slot.n_rays, 256), &found);
     }
 
+    /// The rays of a picture, what they have accumulated, and their view.
+    fn picture_bindings<'a>(&'a self, canvas: &'a Canvas) -> [(&'static str, &'a Buffer); 5] {
+        [
+            ("batch", &self.samples.batch),
+            ("march", &self.slot.march),
+            ("view", &canvas.view),
+            ("rays", &self.slot.rays),
+            ("light", &canvas.light),
+        ]
+    }
+
     /// Keeps the distances at which the weights of the rays first reach 1/64.
     pub(crate) fn keep_fronts(&self, list: &mut Passes, canvas: &Canvas) {
-        let Self { gpu, pipelines, samples, slot, .. } = *self;
-        let kept = [
-            ("batch", &samples.batch),
-            ("march", &slot.march),
-            ("view", &canvas.view),
-            ("rays", &slot.rays),
-            ("light", &canvas.light),
-            ("fronts", &canvas.fronts),
-        ];
+        let Self { gpu, pipelines, slot, .. } = *self;
+        let kept = [&self.picture_bindings(canvas)[..], &[("fronts", &canvas.fronts)]].concat();
         list.dispatch(gpu, &pipelines.keep_fronts, groups(slot.n_rays, 64), &kept);
     }
 
     /// Generates the rays of a picture's pixels.
     pub(crate) fn picture_rays(&self, list: &mut Passes, canvas: &Canvas) {
-        let Self { gpu, pipelines, samples, slot, .. } = *self;
-        let posed = [
-            ("batch", &samples.batch),
-            ("march", &slot.march),
-            ("view", &canvas.view),
-            ("rays", &slot.rays),
-            ("light", &canvas.light),
-            ("fronts", &canvas.fronts),
-        ];
+        let Self { gpu, pipelines, slot, .. } = *self;
+        let posed = [&self.picture_bindings(canvas)[..], &[("fronts", &canvas.fronts)]].concat();
         list.dispatch(gpu, &pipelines.picture_rays, groups(slot.n_rays, 64), &posed);
     }
 
-    /// Writes the pixels of the rays. Run after
-    /// [`FieldPasses::picture_colors`].
+    /// Writes the pixels of the rays. Run after [`FieldPasses::picture_colors`].
     pub(crate) fn show(&self, list: &mut Passes, canvas: &Canvas) {
         let Self { gpu, pipelines, samples, slot, .. } = *self;
-        let shown = [
-            ("batch", &samples.batch),
-            ("march", &slot.march),
-            ("view", &canvas.view),
+        let colored = [
             ("backdrop", &canvas.backdrop),
-            ("rays", &slot.rays),
             ("selected_weights", &canvas.selected_weights),
             ("colors", &samples.colors),
             ("pixels", &canvas.pixels),
             ("depths", &canvas.depths),
-            ("light", &canvas.light),
         ];
+        let shown = [&self.picture_bindings(canvas)[..], &colored].concat();
         list.dispatch(gpu, &pipelines.show_rays, groups(slot.n_rays, 64), &shown);
     }
 

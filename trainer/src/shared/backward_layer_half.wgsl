@@ -20,15 +20,5 @@ fn evaluate_layer(layer: Layer, tile: u32, lane: u32) {
         coopStoreT(left, &wg_sums[row * STRIDE], STRIDE);
         coopStoreT(right, &wg_sums[row * STRIDE + 4u], STRIDE);
     }
-    // The sums are complete before they are read, and the inputs were read before they are overwritten.
-    workgroupBarrier();
-    if layer.stored_row != NOT_STORED {
-        for (var item = lane; item < layer.n_in * PARTS; item += LANES) {
-            let row = item / PARTS;
-            let part = item % PARTS;
-            put_four(0u, row, part, layer_output(layer, tile, row, part, out_four(0u, row, part)));
-        }
-        // The rows are written before the next layer reads them, and the sums were read before it overwrites them.
-        workgroupBarrier();
-    }
+    finish_layer(layer, tile, layer.n_in, lane);
 }

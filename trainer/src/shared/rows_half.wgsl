@@ -40,3 +40,19 @@ fn four(bank: u32, row: u32, part: u32) -> vec4f { return vec4f(wg_halves[row * 
 
 // Outputs of a layer.
 fn out_four(bank: u32, row: u32, part: u32) -> vec4f { return wg_sums[row * STRIDE + part]; }
+
+// Converts the sums of a layer into the inputs of the next one, unless it is the last of its network. Every lane must call
+// it.
+fn finish_layer(layer: Layer, tile: u32, n_rows: u32, lane: u32) {
+    // The sums are complete before they are read, and the inputs were read before they are overwritten.
+    workgroupBarrier();
+    if layer.stored_row != NOT_STORED {
+        for (var item = lane; item < n_rows * PARTS; item += LANES) {
+            let row = item / PARTS;
+            let part = item % PARTS;
+            put_four(0u, row, part, layer_output(layer, tile, row, part, out_four(0u, row, part)));
+        }
+        // The rows are written before the next layer reads them, and the sums were read before it overwrites them.
+        workgroupBarrier();
+    }
+}
