@@ -3,7 +3,7 @@
 use crate::error::Context;
 use crate::{Error, run_folder};
 use calibration::{Alignment, CameraCorrection, Estimate};
-use capture::config::{Camera, Parent, Rig, TimeOffset};
+use capture::config::{Base, Camera, Parent, Rig, TimeOffset};
 use keyframe::listed;
 use kinematics::{Chain, Intrinsics, Stamp, Transform};
 use nalgebra::{Translation3, UnitQuaternion, Vector3};
@@ -100,7 +100,6 @@ pub fn with_intrinsics(rig: &Rig, name: &str, intrinsics: &Intrinsics) -> Result
 pub fn with_extrinsics(rig: &Rig, name: &str, parent: Parent, pose: &Transform) -> Result<Rig, Error> {
     let given = camera(rig, name)?.parent;
     let is_converted = (parent, given) == (Parent::Base, Parent::World) && !rig.has_moving_base();
-    let pose = if is_converted { &(rig.base.world_from_base * pose) } else { pose };
     if given != parent && !is_converted {
         return Err(Error::BadInput(format!(
             "--camera {name}: its parent in the rig file is {}, but the calibrated pose is relative to the {}; change parent, or the setup of the calibration",
@@ -110,8 +109,17 @@ pub fn with_extrinsics(rig: &Rig, name: &str, parent: Parent, pose: &Transform) 
     }
     let mut rig = rig.clone();
     let camera = rig.cameras.iter_mut().find(|camera| *camera.name == *name);
-    camera.expect("checked above").parent_from_camera = *pose;
+    camera.expect("checked above").parent_from_camera = parent_from_camera(&rig.base, given, pose);
     Ok(rig)
+}
+
+/// `parent_from_camera` for a pose of a camera on the flange or in a fixed base: the latter is converted if the parent is
+/// the world.
+pub fn parent_from_camera(base: &Base, parent: Parent, pose: &Transform) -> Transform {
+    match parent {
+        Parent::World => base.world_from_base * pose,
+        Parent::Flange | Parent::Base => *pose,
+    }
 }
 
 /// Checks that calibrated images have the size of a camera's images.

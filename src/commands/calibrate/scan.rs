@@ -13,12 +13,13 @@ use capture::{ArmDuringImage, CalibrationImage, CalibrationImages, calibration_i
 use drivers::Sample;
 use kinematics::{Chain, Intrinsics, Stamp, Transform};
 use session::calibration_report::{Photo, Photos, Unused};
+use session::corrected_rig;
 use std::path::Path;
 use targets::{GrayImage, TargetSpec};
 
 /// Time for which devices are read if no flag limits it, seconds.
 const DEFAULT_SECS: f64 = 30.0;
-/// Images that move further during the exposure of all rows are not used, pixels.
+/// Maximum predicted image motion over readout, exposure and stamp uncertainty, pixels.
 const MAX_SHIFT_PX: f64 = 3.0;
 
 /// Images of one camera in which a target was searched.
@@ -213,10 +214,13 @@ impl Scan {
 
     /// `parent_from_camera` of the rig file for an estimated pose, which is relative to the flange or base.
     pub(super) fn rig_pose(&self, parent_from_camera: &Transform) -> Transform {
-        match self.camera.parent {
-            Parent::World => self.rig.base.world_from_base * parent_from_camera,
-            Parent::Flange | Parent::Base => *parent_from_camera,
-        }
+        corrected_rig::parent_from_camera(&self.rig.base, self.camera.parent, parent_from_camera)
+    }
+
+    /// Whether the rows of an image are exposed one after another, so that the corrections of corners depend on the pose
+    /// of the camera.
+    pub(super) fn is_rolling_shutter(&self) -> bool {
+        self.camera.readout_micros.is_some_and(|micros| micros > 0.0)
     }
 
     /// The images, with corners corrected for a rolling shutter.

@@ -218,8 +218,10 @@ impl Args {
             },
         };
         let mut calibration = calibrate_hand_eye(&input)?;
-        if let Source::Scan { scan, .. } = source {
-            // The correction for a rolling shutter depends on the pose of the camera.
+        if let Source::Scan { scan, .. } = source
+            && scan.is_rolling_shutter()
+        {
+            // The corners were corrected with the pose in the rig file. Now a better one is known.
             input.samples = scan.samples(Some(&calibration.parent_from_camera)).0;
             calibration = calibrate_hand_eye(&input)?;
         }
