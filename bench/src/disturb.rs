@@ -209,18 +209,22 @@ fn exposure_step(keyframes: &[Arc<Keyframe>], step_ev: f64) -> Vec<Arc<Keyframe>
     let Some(middle) = stamps.get(stamps.len() / 2).copied() else { return keyframes.to_vec() };
     let [darker, brighter] = [-0.5, 0.5].map(|fraction| exposure_table(2.0_f64.powf(fraction * step_ev)));
     map(keyframes, |keyframe| {
-        let table = if keyframe.stamp < middle { &darker } else { &brighter };
-        let pixels = keyframe.rgba_srgb.chunks_exact(4);
-        keyframe.rgba_srgb = pixels
-            .flat_map(|rgba| [table[rgba[0] as usize], table[rgba[1] as usize], table[rgba[2] as usize], rgba[3]])
-            .collect();
+        expose(keyframe, if keyframe.stamp < middle { &darker } else { &brighter });
     })
+}
+
+/// Replaces the colors of an image by those of the table.
+pub(crate) fn expose(keyframe: &mut Keyframe, table: &[u8; 256]) {
+    let pixels = keyframe.rgba_srgb.chunks_exact(4);
+    keyframe.rgba_srgb = pixels
+        .flat_map(|rgba| [table[rgba[0] as usize], table[rgba[1] as usize], table[rgba[2] as usize], rgba[3]])
+        .collect();
 }
 
 /// Maps each sRGB byte to its value after multiplying the light by `gain`: linear light, clipped, rounded to 8 bits.
 ///
 /// Source: IEC 61966-2-1 for both transfer functions.
-fn exposure_table(gain: f64) -> [u8; 256] {
+pub(crate) fn exposure_table(gain: f64) -> [u8; 256] {
     std::array::from_fn(|byte| {
         let srgb = byte as f64 / 255.0;
         let linear = if srgb <= 0.04045 { srgb / 12.92 } else { ((srgb + 0.055) / 1.055).powf(2.4) };
@@ -250,14 +254,14 @@ fn subsample(keyframes: &[Arc<Keyframe>], n: f64) -> Vec<Arc<Keyframe>> {
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use super::*;
 
     const TOLERANCE: f64 = 1e-9; // Rounding errors of products of poses with elements near 1.
 
     /// A camera that moves along a line and rotates: 0.1 m and 0.02 rad per keyframe, 10 keyframes per second, gray
     /// images.
-    fn capture(n: i64) -> Vec<Arc<Keyframe>> {
+    pub(crate) fn capture(n: i64) -> Vec<Arc<Keyframe>> {
         let keyframe = |ix: i64| {
             let along = ix as f64;
             Arc::new(Keyframe {

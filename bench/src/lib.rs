@@ -38,6 +38,7 @@ mod findings;
 mod growth;
 pub mod kernels;
 pub mod live;
+mod live_disturbance;
 pub mod memory;
 mod over_time;
 mod peer;
@@ -51,6 +52,7 @@ mod viewer;
 pub use disturb::Disturbance;
 pub use findings::{BenchResult, Findings};
 pub use growth::{Excluded, Growth, Sample, resident_bytes};
+pub use live_disturbance::LiveDisturbance;
 pub use over_time::{Bucket, OverTime, Timeline, Trend};
 pub use runs::{BenchObserver, Disturbed, Host, Run, RunReport, RunScores, RunSettings, RunsOptions};
 // Errors of benches come from sessions and files, so benches use the error type of `session`.

@@ -4,6 +4,7 @@
 //! All times are on the clock of this process, from mid-exposure of an image to the arrival of a picture at its viewer.
 
 use crate::findings::Findings;
+use crate::live_disturbance::LiveDisturbance;
 use crate::over_time::{OverTime, Timeline};
 use crate::viewer::{ReceivedPicture, Viewer};
 use capture::config::Parent;
@@ -58,12 +59,15 @@ pub struct Conditions {
     pub n_viewers: u64,
     /// Error added to the calibration of the recording, if any.
     pub hand_eye_error: Option<HandEyeError>,
+    /// Disturbance of the images or poses, if any.
+    pub disturbance: Option<LiveDisturbance>,
 }
 
 impl fmt::Display for Conditions {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(&counted(self.n_viewers, "viewer"))?;
-        self.hand_eye_error.map_or(Ok(()), |error| write!(f, ", {error}"))
+        self.hand_eye_error.map_or(Ok(()), |error| write!(f, ", {error}"))?;
+        self.disturbance.map_or(Ok(()), |disturbance| write!(f, ", {disturbance}"))
     }
 }
 

@@ -69,7 +69,7 @@ pub use error::{Context, Error, Result};
 pub use evaluate::Evaluator;
 pub use gpu_loss::lose_gpu_at_step;
 pub use ledger::{KeyframeTimes, Ledger};
-pub use live::{Live, LiveOptions, Pace};
+pub use live::{KeyframeChange, Live, LiveOptions, Pace};
 pub use methods::methods_of;
 pub use observer::{DoneEvent, Evaluation, FinishedReport, Observer, ProfileEvent, SessionEvent, SessionProgress};
 pub use read_progress::{OnReadProgress, ReadProgress, ignore_progress};

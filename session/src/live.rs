@@ -73,7 +73,11 @@ pub struct Live {
     recoveries: Recoveries,
     /// Times of the keyframes of the first session.
     ledger: Ledger,
+    keyframe_change: Option<KeyframeChange>,
 }
+
+/// Changes a keyframe before the models receive it.
+pub type KeyframeChange = Box<dyn FnMut(Arc<Keyframe>) -> Arc<Keyframe>>;
 
 impl Live {
     /// Combines the parts. Training starts with the first call of [`Self::advance`].
@@ -96,6 +100,7 @@ impl Live {
             notes: options.notes,
             recoveries: Recoveries::new(options.open_gpu),
             ledger: Ledger::default(),
+            keyframe_change: None,
         }
     }
 
@@ -107,6 +112,11 @@ impl Live {
             self.hub.set_scene_hint(hint);
         }
         self
+    }
+
+    /// Changes all following keyframes before the models receive them, for benchmarks with disturbed data.
+    pub fn change_keyframes(&mut self, change: KeyframeChange) {
+        self.keyframe_change = Some(change);
     }
 
     /// Publishes the keyframes and the corrections of live images, as estimated by the first model.
@@ -293,6 +303,14 @@ impl Live {
         if self.is_render_pending() {
             return Ok(());
         }
+        let before = Instant::now();
+        self.train_slice()?;
+        self.budget.add_training(before.elapsed());
+        Ok(())
+    }
+
+    /// Trains one model for a slice: waits for its previous submit, then submits more steps and returns.
+    fn train_slice(&mut self) -> crate::Result<()> {
         let is_watched = self.hub.n_clients() > 0;
         self.sessions.iter_mut().for_each(|session| session.set_watched(is_watched));
         let is_paced = self.pace != Pace::RealTime && !self.feed.ended();
@@ -301,13 +319,11 @@ impl Live {
             true => due[ix].saturating_sub(session.progress().step),
             false => u64::MAX,
         };
-        let before = Instant::now();
         let step_before = self.sessions[0].progress().step;
         let (hub, budget) = (&self.hub, self.budget);
         time_slices::train_next(&mut self.sessions, max_steps, || {
             budget.may_render() && hub.wait_for_request(Duration::ZERO)
         })?;
-        self.budget.add_training(before.elapsed());
         // Steps before this slice are complete, because at most one submit is in flight.
         self.ledger.completed(step_before);
         Ok(())
@@ -321,6 +337,7 @@ impl Live {
     /// Draws requested pictures as long as training keeps its share of the time.
     fn render(&mut self) -> crate::Result<()> {
         let started = Instant::now();
+        let can_train = self.is_training() && !self.is_idle() && !self.is_scoring();
         if !self.is_training() || self.is_idle() {
             self.budget.refill(); // Training is idle, so drawing does not delay it.
         }
@@ -344,12 +361,17 @@ impl Live {
                     break;
                 }
             }
+            // Steps that are queued behind the pictures keep the GPU busy while the pictures are delivered.
+            let is_any_on_gpu =
+                queued.iter().any(|render| render.queued.as_ref().is_ok_and(|queued| !queued.is_ready()));
+            let trained = if can_train && is_any_on_gpu { self.train_slice() } else { Ok(()) };
             let mut began = before;
             for picture in queued {
                 self.deliver(picture, began);
                 began = Instant::now();
             }
             self.budget.add_render(before.elapsed());
+            trained?;
         }
         Ok(())
     }
@@ -476,6 +498,10 @@ impl Live {
     fn apply(&mut self, FeedItem { change, times }: FeedItem) -> crate::Result<()> {
         match change {
             Change::Accepted(keyframe) => {
+                let keyframe = match &mut self.keyframe_change {
+                    Some(change) => change(keyframe),
+                    None => keyframe,
+                };
                 let pushed_at_step = self.sessions[0].progress().step;
                 self.keyframes.push(keyframe.clone());
                 let mut pushed = Ok(());

@@ -7,7 +7,7 @@ use crate::exit::{self, Exit, InsufficientData};
 use crate::print;
 use anyhow::Context;
 use bench::live::{Conditions, HandEyeError, InputCounts, LiveRun, findings};
-use bench::{BenchResult, Timeline, Viewer, ViewerOptions};
+use bench::{BenchResult, Disturbance, LiveDisturbance, Timeline, Viewer, ViewerOptions};
 use capture::{Rig, open};
 use session::run_folder::CreatedFolders;
 use std::ffi::OsString;
@@ -47,6 +47,10 @@ pub(crate) struct Args {
     /// Number of directions of the hand-eye error, one run each
     #[arg(long, value_name = "N", default_value_t = 1, requires = "hand_eye_error", value_parser = clap::value_parser!(u64).range(1..=100))]
     directions: u64,
+    /// Repeat the run with one viewer and each of these disturbances: `pose-noise` in mm, `clock-offset` in ms, or
+    /// `exposure`, a step in EV in the middle of the run
+    #[arg(long, value_name = "WHAT:SIZE,...", value_delimiter = ',', value_parser = disturbance)]
+    disturb: Vec<LiveDisturbance>,
     /// Folder for charts and numbers
     #[arg(long, value_name = "DIR", default_value = "bench-live")]
     out: PathBuf,
@@ -70,6 +74,24 @@ fn hand_eye_error(text: &str) -> Result<(f64, f64), String> {
     parsed
         .filter(|(deg, mm)| (0.0..=90.0).contains(deg) && (0.0..=1000.0).contains(mm))
         .ok_or_else(|| "must be degrees up to 90 and millimeters up to 1000, such as 1,5".to_owned())
+}
+
+fn disturbance(text: &str) -> Result<LiveDisturbance, String> {
+    let parsed = text.split_once(':').and_then(|(name, level)| {
+        let is_named = |disturbance: &&Disturbance| disturbance.name() == name.trim();
+        let disturbance = *Disturbance::ALL.iter().find(is_named)?;
+        Some(LiveDisturbance { disturbance, level: level.trim().parse().ok()? })
+    });
+    let max = |disturbance| match disturbance {
+        Disturbance::PoseNoise => 1000.0,
+        Disturbance::ClockOffset => 500.0,
+        Disturbance::Exposure => 10.0,
+        Disturbance::Keyframes => f64::NEG_INFINITY, // A live run has no fixed number of keyframes.
+    };
+    parsed.filter(|parsed| (0.0..=max(parsed.disturbance)).contains(&parsed.level)).ok_or_else(|| {
+        "must be pose-noise:MM up to 1000, clock-offset:MS up to 500 or exposure:EV up to 10, such as exposure:0.5"
+            .to_owned()
+    })
 }
 
 pub(super) fn run(args: &Args) -> anyhow::Result<Exit> {
@@ -120,12 +142,15 @@ fn describe(run: &LiveRun) -> String {
 
 impl Args {
     fn conditions(&self) -> Vec<Conditions> {
-        let right = self.viewers.iter().map(|&n_viewers| Conditions { n_viewers, hand_eye_error: None });
+        let with_one = Conditions { n_viewers: 1, hand_eye_error: None, disturbance: None };
+        let right = self.viewers.iter().map(|&n_viewers| Conditions { n_viewers, ..with_one });
         let wrong = self.hand_eye_error.into_iter().flat_map(|(degrees, millimeters)| {
             let error = move |seed| HandEyeError { degrees, millimeters, seed };
-            (1..=self.directions).map(move |seed| Conditions { n_viewers: 1, hand_eye_error: Some(error(seed)) })
+            (1..=self.directions).map(move |seed| Conditions { hand_eye_error: Some(error(seed)), ..with_one })
         });
-        right.chain(wrong).collect()
+        let disturbed =
+            self.disturb.iter().map(|&disturbance| Conditions { disturbance: Some(disturbance), ..with_one });
+        right.chain(wrong).chain(disturbed).collect()
     }
 
     /// Measures one run, then removes its folder. Returns its measurements and data losses, or `None` if it was
@@ -150,12 +175,19 @@ impl Args {
         if let Some(error) = conditions.hand_eye_error {
             error.apply(&mut rig);
         }
+        if let Some(disturbance) = conditions.disturbance {
+            disturbance.apply_to_rig(&mut rig);
+        }
         rig.write_resolved(folder).with_context(|| format!("cannot write into {}", folder.display()))?;
         let mut flags = vec!["--from".into(), self.recording.clone().into(), "--real-time".into()];
         flags.extend(self.repeat.then(|| "--repeat".into()));
         let (rig_file, out) = (folder.join(drivers::recording::RIG_FILE), folder.join("out"));
         let flags = run_flags::parse(&rig_file, self.seconds, (&out, self.json), flags, &self.run_flags)?;
         let mut running = run::start(&flags, None, &mut CreatedFolders::default())?;
+        let change = conditions.disturbance.and_then(|disturbance| disturbance.keyframe_change(1, 0.5 * self.seconds));
+        if let Some(change) = change {
+            running.live.change_keyframes(change);
+        }
         let address = running.server.address();
         let period = self.picture_rate.map_or(Duration::ZERO, |rate_hz| Duration::from_secs_f64(1.0 / rate_hz));
         let options = ViewerOptions { size_px: self.size, is_panorama: self.panorama, period };
@@ -202,13 +234,18 @@ mod tests {
             "2",
             "--size",
             "640x480",
+            "--disturb",
+            "pose-noise:0.5,exposure:1",
         ];
         let args = Flags::parse_from(line).args;
         let conditions: Vec<String> = args.conditions().iter().map(Conditions::to_string).collect();
         assert_eq!(conditions[..2], ["0 viewers", "4 viewers"]);
         assert_eq!(conditions[3], "1 viewer, hand-eye off by 1 degrees, 5 mm (seed 2)");
-        assert_eq!((conditions.len(), args.size), (4, [640, 480]));
-        for invalid in [["--size", "10"], ["--size", "0x5"], ["--hand-eye-error", "1"], ["--hand-eye-error", "100,1"]] {
+        assert_eq!(conditions[4..], ["1 viewer, pose-noise 0.5 mm", "1 viewer, exposure 1 EV"]);
+        assert_eq!((conditions.len(), args.size), (6, [640, 480]));
+        let invalid_disturbances = [["--disturb", "keyframes:3"], ["--disturb", "exposure"], ["--disturb", "fog:1"]];
+        let invalid = [["--size", "10"], ["--size", "0x5"], ["--hand-eye-error", "1"], ["--hand-eye-error", "100,1"]];
+        for invalid in invalid.into_iter().chain(invalid_disturbances) {
             assert!(Flags::try_parse_from(["live", "scan.mcap"].iter().chain(&invalid)).is_err(), "{invalid:?}");
         }
     }

@@ -51,6 +51,7 @@ use seeding::Seeding;
 use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
+use training::SkippedSteps;
 use view_set::ViewSet;
 
 /// Trains 3D Gaussian splats on keyframes.
@@ -66,6 +67,7 @@ pub struct SplatTrainer {
     seeding: Seeding,
     trials: SplatTrials,
     growth_search: GrowthSearch,
+    skipped: SkippedSteps,
     /// Camera corrections loaded with a saved model.
     saved_corrections: BTreeMap<String, CameraCorrection>,
     /// Background loaded with a saved model.
@@ -94,6 +96,7 @@ impl SplatTrainer {
             seeding: Seeding::new(&options, is_software),
             trials: SplatTrials::new(&options.common.cameras, options.specific.count),
             growth_search: GrowthSearch::new(options.specific.count == CountPolicy::Tested),
+            skipped: SkippedSteps::default(),
             saved_corrections: BTreeMap::new(),
             saved_background_srgb: [0.0; 3],
             recorder: Recorder::new(gpu),

@@ -136,7 +136,8 @@ impl TrainedModel {
         self.is_full = is_full;
     }
 
-    fn stop_growing(&mut self, error: &Error) {
+    /// Keeps the number of splats from now on, because GPU memory is too small.
+    pub(super) fn stop_growing(&mut self, error: &Error) {
         if !std::mem::replace(&mut self.is_full, true) {
             log::warn!("the model stops growing at {} splats: {error}", self.splats.n_splats);
         }

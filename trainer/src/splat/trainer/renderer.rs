@@ -13,6 +13,9 @@ use crate::{Error, Packing, QueuedPicture, Rendered};
 /// Minimum capacity of the bin lists, in entries.
 const MIN_ENTRIES: u32 = 1 << 14;
 
+/// Divisors of the need that give the headroom of grown buffers, tried in this order: 1/2, 1/16, none.
+const HEADROOM_DIVISORS: [u32; 3] = [2, 16, u32::MAX];
+
 /// Draws pinhole views of splats.
 #[derive(Debug)]
 pub(super) struct Renderer {
@@ -221,21 +224,31 @@ impl Renderer {
         self.reserve(recorder, ScratchSize { n_splats: capacity, n_entries, n_slots, ..have })
     }
 
-    /// Grows the scratch buffers if the submit failed. Returns whether the submit failed.
+    /// Grows the scratch buffers if the submit failed, beyond the need if memory permits. Returns whether the submit
+    /// failed.
     pub(super) fn grow_scratch(&mut self, recorder: &mut Recorder, counters: &[u32]) -> Result<bool, Error> {
         if counters[status::FAILED] == 0 {
             return Ok(false);
         }
         let Some((size, _)) = self.scratch else { return Ok(false) };
-        let larger = |need: u32, have: u32| if need > have { need.saturating_add(need / 2) } else { have };
-        let need = ScratchSize {
-            n_entries: larger(counters[status::NEED_ENTRIES], size.n_entries),
-            n_slots: if size.n_slots == 0 { 0 } else { larger(counters[status::NEED_SLOTS], size.n_slots) },
-            ..size
-        };
-        log::debug!("splat: growing the intersection buffers to {need:?}");
-        self.reserve(recorder, need)?;
-        Ok(true)
+        let mut grown = Ok(());
+        for headroom_divisor in HEADROOM_DIVISORS {
+            let larger = |need: u32, have: u32| match need > have {
+                true => need.saturating_add(need / headroom_divisor),
+                false => have,
+            };
+            let need = ScratchSize {
+                n_entries: larger(counters[status::NEED_ENTRIES], size.n_entries),
+                n_slots: if size.n_slots == 0 { 0 } else { larger(counters[status::NEED_SLOTS], size.n_slots) },
+                ..size
+            };
+            log::debug!("splat: growing the intersection buffers to {need:?}");
+            grown = self.reserve(recorder, need);
+            if !grown.as_ref().is_err_and(Error::is_out_of_memory) {
+                break;
+            }
+        }
+        grown.map(|()| true)
     }
 
     fn reserve(&mut self, recorder: &mut Recorder, need: ScratchSize) -> Result<(), Error> {

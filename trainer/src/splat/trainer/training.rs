@@ -172,12 +172,56 @@ impl SplatTrainer {
     pub(super) fn finish_in_flight(&mut self) -> Result<bool, Error> {
         let Some(counters) = self.optimizer.submits.finish(&self.recorder.gpu)? else { return Ok(false) };
         self.optimizer.log_non_finite(counters[status::N_NON_FINITE].into());
-        let failed = self.renderer.grow_scratch(&mut self.recorder, &counters)?;
-        if failed {
-            self.schedule.step = u64::from(counters[status::STEP]);
-            self.optimizer.clear_failure(&self.recorder.gpu);
+        let grown = self.renderer.grow_scratch(&mut self.recorder, &counters);
+        if matches!(grown, Ok(false)) {
+            return Ok(false);
         }
-        Ok(failed)
+        let failed_step = u64::from(counters[status::STEP]);
+        self.schedule.step = failed_step;
+        match grown {
+            Err(error) if error.is_out_of_memory() => self.skip_step(error)?,
+            grown => _ = grown?,
+        }
+        self.optimizer.clear_failure(&self.recorder.gpu);
+        Ok(true)
+    }
+
+    /// Skips the next step, because the buffers for its image cannot be allocated, and stops growing, because more splats
+    /// need even larger buffers.
+    ///
+    /// # Errors
+    ///
+    /// The given error if the steps of all images were skipped.
+    fn skip_step(&mut self, error: Error) -> Result<(), Error> {
+        self.model.stop_growing(&error);
+        let step = self.schedule.step;
+        if self.skipped.add(step) > 2 * self.views.n_active() as u64 {
+            return Err(error);
+        }
+        self.schedule.step = step + 1;
+        let next_step = u32::try_from(step + 1).unwrap_or(u32::MAX);
+        self.optimizer.write_counter(&self.recorder.gpu, status::STEP, next_step);
+        Ok(())
+    }
+}
+
+/// Steps that were skipped one after another.
+#[derive(Debug, Default)]
+pub(super) struct SkippedSteps {
+    last: u64,
+    n_consecutive: u64,
+}
+
+impl SkippedSteps {
+    /// Adds a step. Returns the number of consecutive skipped steps up to this one.
+    fn add(&mut self, step: u64) -> u64 {
+        if self.n_consecutive == 0 {
+            log::warn!("images that need too much GPU memory are skipped in training");
+        }
+        let is_next = step == self.last + 1;
+        self.n_consecutive = if is_next { self.n_consecutive + 1 } else { 1 };
+        self.last = step;
+        self.n_consecutive
     }
 }
 
@@ -185,4 +229,63 @@ impl SplatTrainer {
 #[expect(clippy::cast_possible_truncation, reason = "bits of a hash")]
 pub(super) fn growth_key(seed: u64, step: u64) -> u32 {
     (step as u32).wrapping_mul(0x9e37_79b9) ^ seed as u32
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::Method;
+    use crate::gpu::{Gpu, GpuOptions};
+    use crate::splat::training_tests::{n_keyframes, options, train};
+    use keyframe::{Keyframe, Split};
+    use std::sync::Arc;
+
+    const N_COVERING: u32 = 2000;
+
+    /// A trainer whose GPU has too little memory for 2000 splats that cover the whole image, and its keyframes.
+    fn with_little_memory() -> (SplatTrainer, Vec<Arc<Keyframe>>) {
+        const MAX_BINDING_BYTES: u64 = 1_600_000; // Slightly more than the initial buffers.
+        let gpu =
+            Gpu::open(&GpuOptions { max_binding_bytes: Some(MAX_BINDING_BYTES), ..GpuOptions::default() }).unwrap();
+        let keyframes = n_keyframes(&gpu, 10, true);
+        let mut trainer =
+            SplatTrainer::new(gpu, options().with(|options| options.specific.coarse_steps = Some([0, 0]))).unwrap();
+        keyframes.iter().for_each(|keyframe| trainer.push(keyframe.clone()).unwrap());
+        train(&mut trainer, 3);
+        trainer.finish_in_flight().unwrap();
+        trainer.grow_to(N_COVERING).unwrap();
+        (trainer, keyframes)
+    }
+
+    /// Moves 2000 splats in front of a camera, so close that each covers the image.
+    fn cover(trainer: &mut SplatTrainer, keyframe: &Keyframe, log_scale: f32) {
+        const N: usize = N_COVERING as usize;
+        assert_eq!(trainer.model.splats.n_splats, N_COVERING);
+        let center = keyframe.world_from_camera * nalgebra::Point3::new(0.0, 0.0, 0.3);
+        let [x, y, z] = crate::gpu::f32s_of(center.coords.into());
+        let (gpu, splats) = (&trainer.recorder.gpu, &trainer.model.splats);
+        gpu.write(&splats.means, 0, bytemuck::cast_slice(&[[x, y, z, 0.0]; N]));
+        gpu.write(&splats.shapes, 0, bytemuck::cast_slice(&[[log_scale, log_scale, log_scale, -3.0]; N]));
+    }
+
+    #[test]
+    fn image_that_needs_too_much_memory_is_skipped() {
+        let (mut trainer, keyframes) = with_little_memory();
+        let covered = keyframes.iter().find(|keyframe| keyframe.split == Split::Train).unwrap();
+        cover(&mut trainer, covered, 0.05_f32.ln());
+        let n_splats = trainer.model.splats.n_splats;
+        train(&mut trainer, 40);
+        assert_eq!(trainer.n_total_steps().unwrap(), 43);
+        assert!(trainer.skipped.n_consecutive > 0, "the buffers were large enough for all images");
+        assert!(trainer.model.is_full() && trainer.model.splats.n_splats == n_splats, "the model still grows");
+        assert!(trainer.arrays().unwrap().checked().is_ok(), "a parameter is not finite");
+    }
+
+    #[test]
+    fn training_fails_if_no_image_fits_into_memory() {
+        let (mut trainer, keyframes) = with_little_memory();
+        cover(&mut trainer, &keyframes[0], 100.0_f32.ln());
+        let error = (0..100).find_map(|_| trainer.step(1).err()).expect("all images are skipped");
+        assert!(error.is_out_of_memory(), "{error}");
+    }
 }
