@@ -22,6 +22,9 @@ pub enum CameraRefinement {
     Try(Vec<ParamSet>),
     /// Optimizes the first set from the first step on, and tries each of the others.
     AlwaysAndTry(ParamSet, Vec<ParamSet>),
+    /// Optimizes the first set from the first step on, and also the second as soon as arriving keyframes show that it is
+    /// needed.
+    AlwaysAndWatch(ParamSet, ParamSet),
 }
 
 impl Default for CameraRefinement {
@@ -34,7 +37,7 @@ impl CameraRefinement {
     /// The parameters that are optimized without a trial.
     pub fn always(&self) -> ParamSet {
         match self {
-            Self::Always(params) | Self::AlwaysAndTry(params, _) => *params,
+            Self::Always(params) | Self::AlwaysAndTry(params, _) | Self::AlwaysAndWatch(params, _) => *params,
             Self::Try(_) => ParamSet::empty(),
         }
     }
@@ -43,7 +46,15 @@ impl CameraRefinement {
     pub fn candidates(&self) -> &[ParamSet] {
         match self {
             Self::Try(candidates) | Self::AlwaysAndTry(_, candidates) => candidates,
-            Self::Always(_) => &[],
+            Self::Always(_) | Self::AlwaysAndWatch(..) => &[],
+        }
+    }
+
+    /// The parameters that are optimized once arriving keyframes show that they are needed.
+    pub fn watched(&self) -> ParamSet {
+        match self {
+            Self::AlwaysAndWatch(_, params) => *params,
+            Self::Always(_) | Self::Try(_) | Self::AlwaysAndTry(..) => ParamSet::empty(),
         }
     }
 }

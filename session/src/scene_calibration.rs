@@ -127,6 +127,9 @@ fn without_image_poses(choice: CameraRefinement) -> CameraRefinement {
             without(set),
             sets.into_iter().map(without).filter(|set| !set.is_empty()).collect(),
         ),
+        CameraRefinement::AlwaysAndWatch(set, watched) => {
+            CameraRefinement::AlwaysAndWatch(without(set), without(watched))
+        }
     }
 }
 

@@ -198,13 +198,14 @@ impl TrainingOptions {
     }
 
     /// Which calibration parameters a live run estimates. Without the flag, these are all that registration or features can
-    /// estimate; or none on a software adapter, where training is already slow.
+    /// estimate, and image gains once the exposure changes; or none on a software adapter, where training is already slow.
     pub fn refining_live(&self, available: AvailableData, software: bool) -> Result<RefineSettings, Error> {
         if !self.refine.is_empty() || software {
             return self.refining(available, Refine::None);
         }
         let settings = available.auto_settings();
-        Ok(RefineSettings { with_scene: CameraRefinement::Always(settings.with_scene.always()), ..settings })
+        let with_scene = CameraRefinement::AlwaysAndWatch(settings.with_scene.always(), ParamSet::IMAGE_GAINS);
+        Ok(RefineSettings { with_scene, ..settings })
     }
 
     /// The rig file keys that the flags override.
@@ -343,7 +344,8 @@ mod tests {
             let available = AvailableData { many_images_per_camera, ..available(joints, depth) };
             let options = TrainingOptions::default();
             assert_eq!(options.refining(available, Refine::Auto).unwrap().with_scene.always(), always);
-            assert_eq!(options.refining_live(available, false).unwrap().with_scene, CameraRefinement::Always(always));
+            let live = options.refining_live(available, false).unwrap().with_scene;
+            assert_eq!(live, CameraRefinement::AlwaysAndWatch(always, ParamSet::IMAGE_GAINS));
         }
         assert_eq!(refining(&[], true, true), Ok(RefineSettings::default()));
     }

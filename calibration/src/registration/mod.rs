@@ -95,7 +95,7 @@ pub fn align(keyframes: &[Arc<Keyframe>], choice: &CameraRefinement) -> Option<A
         CalibrationModel { set: ParamSet::empty(), fit: None, corrections: Corrections::none(scene.cameras.len()) };
     let (mut trials, mut unobservable) = (Vec::new(), Vec::new());
     let mut kept = match choice {
-        CameraRefinement::Always(set) => {
+        CameraRefinement::Always(set) | CameraRefinement::AlwaysAndWatch(set, _) => {
             let variant = scene.model(*set, &uncorrected)?;
             trials.push(scene.evaluate(*set, &uncorrected, &variant));
             variant

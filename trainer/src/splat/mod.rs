@@ -5,6 +5,7 @@ mod against_twin;
 #[cfg(test)]
 mod alignment_tests;
 pub mod arrays;
+mod arrival_gains;
 pub mod bench;
 mod bounds;
 mod buffers;

@@ -243,7 +243,7 @@ impl Method for SplatTrainer {
         if self.trials.defer_arrival(&keyframe, self.schedule.step) {
             return Ok(());
         }
-        self.add_arrival(keyframe)?;
+        self.add_live_arrival(keyframe)?;
         self.update_growth_search();
         Ok(())
     }

@@ -8,6 +8,7 @@
 //! total loss of all reductions is at most [`MAX_TOTAL_LOSS_DB`]. After the last trial, the validation keyframes become
 //! training keyframes.
 
+use super::arrival_gains::ArrivalGains;
 use super::buffers::SplatBuffers;
 use super::doubling::{DOUBLING_START, DOUBLING_STEPS, Doubling};
 use super::snapshot::Snapshot;
@@ -117,6 +118,8 @@ pub(crate) struct SplatTrials {
     pub(crate) finished: Vec<Trial>,
     /// Optimizer updates that were reverted.
     pub(crate) n_reverted_steps: u64,
+    /// Present until arriving keyframes show that image gains are needed, if this is watched for.
+    arrival_gains: Option<ArrivalGains>,
     trial_phase: SplatTrialPhase,
 }
 
@@ -176,6 +179,8 @@ pub(crate) struct RemainingTrials {
     #[serde(default)]
     doubling: Option<Doubling>,
     degree: u32,
+    #[serde(default)]
+    arrival_gains: Option<ArrivalGains>,
 }
 
 /// Work that is due at a step.
@@ -250,6 +255,7 @@ impl SplatTrials {
             validation: Vec::new(),
             finished: Vec::new(),
             n_reverted_steps: 0,
+            arrival_gains: cameras.watched().contains(GAINS).then(ArrivalGains::default),
             trial_phase,
         }
     }
@@ -419,6 +425,26 @@ impl SplatTrials {
         self.evaluate(Candidate::Cameras(GAINS), baseline_db, variant_db).then_some(GAINS)
     }
 
+    /// Whether arriving keyframes must be compared with pictures, see [`Self::add_arrival_gains`].
+    pub(crate) fn watches_gains(&self) -> bool {
+        self.arrival_gains.is_some()
+    }
+
+    /// Adds a keyframe that was compared with a picture before training on it; see [`ArrivalGains::add`]. Returns the image
+    /// gains if they are needed.
+    pub(crate) fn add_arrival_gains(
+        &mut self,
+        keyframe: &Keyframe,
+        log_gains: [f64; 3],
+        psnr: impl Fn([f64; 3]) -> Option<f64>,
+    ) -> Option<ParamSet> {
+        let trial = self.arrival_gains.as_mut()?.add(&keyframe.camera, log_gains, psnr)?;
+        trial.log_result();
+        self.finished.push(trial);
+        self.arrival_gains = None;
+        Some(GAINS)
+    }
+
     fn evaluate(&mut self, candidate: Candidate, baseline_db: &[f64], variant_db: &[f64]) -> bool {
         log::debug!("{candidate}: PSNR without the change {baseline_db:.3?} dB, with it {variant_db:.3?} dB");
         let mut trial = Trial::of(candidate, baseline_db, variant_db);
@@ -484,6 +510,7 @@ impl SplatTrials {
             count: self.count,
             doubling: self.doubling,
             degree: self.degree,
+            arrival_gains: self.arrival_gains.clone(),
         }
     }
 
@@ -492,6 +519,7 @@ impl SplatTrials {
         self.trial_phase =
             if remaining_trials.is_finished { SplatTrialPhase::Finished } else { SplatTrialPhase::Waiting };
         self.candidates = remaining_trials.params.into();
+        self.arrival_gains = remaining_trials.arrival_gains;
         (self.count, self.doubling) = (remaining_trials.count, remaining_trials.doubling);
         (self.degree, self.finished) = (remaining_trials.degree, finished);
     }

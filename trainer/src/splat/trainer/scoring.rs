@@ -5,10 +5,10 @@ use super::renderer::DrawnView;
 use super::view_set::VIEWS_AT_ONCE;
 use super::{SplatTrainer, displayed};
 use crate::splat::params::Camera;
-use crate::splat::trials::Scores;
+use crate::splat::trials::{Scores, TRIAL_START};
 use crate::splat::views::{Level, camera_of};
 use crate::{Error, Method};
-use calibration::{CalibratedCamera, CameraCorrection, interpolate};
+use calibration::{CalibratedCamera, CameraCorrection, ParamSet, interpolate};
 use keyframe::Keyframe;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -70,16 +70,54 @@ impl SplatTrainer {
             baseline_db.extend(products::psnr_with_gains(products, [1.0; 3]));
             variant_db.extend(products::psnr_with_gains(products, gains));
         }
-        if let Some(gains) = self.trials.decide_gains(&baseline_db, &variant_db) {
-            self.model.cameras.enable(gains);
-            self.prepare_training()?;
-            self.add_gains(&mut known, (0..self.views.len()).collect(), &corrections)?;
-            for (view_ix, gains) in &known {
-                let log_gains = [0, 1, 2].map(|color| gains[color] - mean[color]);
-                let keyframe = self.views.keyframe(*view_ix);
-                self.model.cameras.initialize_gains(&self.recorder.gpu, keyframe, log_gains);
-            }
+        match self.trials.decide_gains(&baseline_db, &variant_db) {
+            Some(gains) => self.enable_gains(gains, known, mean),
+            None => Ok(()),
         }
+    }
+
+    /// Optimizes image gains from now on. Starts with the gains that best match pictures to images, relative to `mean`;
+    /// those in `known` are already computed.
+    fn enable_gains(
+        &mut self,
+        gains: ParamSet,
+        mut known: BTreeMap<usize, [f64; 3]>,
+        mean: [f64; 3],
+    ) -> Result<(), Error> {
+        let corrections = self.learned_corrections()?;
+        self.model.cameras.enable(gains);
+        self.prepare_training()?;
+        self.add_gains(&mut known, (0..self.views.len()).collect(), &corrections)?;
+        for (view_ix, gains) in &known {
+            let log_gains = [0, 1, 2].map(|color| gains[color] - mean[color]);
+            let keyframe = self.views.keyframe(*view_ix);
+            self.model.cameras.initialize_gains(&self.recorder.gpu, keyframe, log_gains);
+        }
+        Ok(())
+    }
+
+    /// Adds a training keyframe that arrives at the current step. If image gains are watched for or optimized, compares the
+    /// keyframe with the picture before training on it.
+    pub(super) fn add_live_arrival(&mut self, keyframe: Arc<Keyframe>) -> Result<(), Error> {
+        let is_watched = self.trials.watches_gains();
+        let is_compared = is_watched || self.model.cameras.set.contains(ParamSet::IMAGE_GAINS);
+        if !is_compared || self.schedule.step < TRIAL_START || self.trials.running_trial().is_some() {
+            return self.add_arrival(keyframe);
+        }
+        let (learn, background_srgb) = (self.learn()?, self.background_srgb());
+        let camera = corrected_camera(&self.learned_corrections()?, &keyframe);
+        let drawn = DrawnView { splats: &self.model.splats, camera: &camera, background_srgb };
+        let rgba = keyframe.rgba_srgb.as_ref();
+        let products = self.renderer.compare_with_upload(&mut self.recorder, drawn, &learn.score, rgba)?;
+        let log_gains = products::log_gains(&products);
+        self.add_arrival(keyframe.clone())?;
+        if is_watched {
+            let psnr = |gains| products::psnr_with_gains(&products, gains);
+            let needed = self.trials.add_arrival_gains(&keyframe, log_gains, psnr);
+            return needed.map_or(Ok(()), |gains| self.enable_gains(gains, BTreeMap::new(), [0.0; 3]));
+        }
+        self.views.assign_lenses(&self.recorder.gpu, &mut self.model.cameras)?;
+        self.model.cameras.initialize_gains(&self.recorder.gpu, &keyframe, log_gains);
         Ok(())
     }
 
@@ -265,5 +303,35 @@ mod tests {
         // Only images near the exposure step show parts of the scene that were captured with both exposures.
         let ratio = gains(&mut trainer, 17) / gains(&mut trainer, 18);
         assert!((1.6..2.4).contains(&ratio), "{ratio}");
+    }
+
+    #[test]
+    fn gains_are_learned_once_arriving_keyframes_show_a_change_of_exposure() {
+        let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+        let even = n_keyframes(&gpu, 36, true);
+        let watching = options().with(|options| {
+            options.common.cameras = CameraRefinement::AlwaysAndWatch(ParamSet::empty(), GAINS);
+            options.common.n_planned_steps = 1000;
+        });
+        let trained_live = |keyframes: &[Arc<Keyframe>]| {
+            let mut trainer = SplatTrainer::new(gpu.clone(), watching.clone()).unwrap();
+            let (first, later) = keyframes.split_at(keyframes.len() / 2 - 3);
+            first.iter().for_each(|keyframe| trainer.push(keyframe.clone()).unwrap());
+            train(&mut trainer, TRIAL_START);
+            for keyframe in later {
+                trainer.push(keyframe.clone()).unwrap();
+                train(&mut trainer, 5);
+            }
+            trainer
+        };
+        let trainer = trained_live(&even);
+        assert!(trainer.trials().is_empty(), "{:?}", trainer.trials());
+        let stepped = with_exposure_step(&even);
+        let mut trainer = trained_live(&stepped);
+        assert!(trainer.trials().len() == 1 && trainer.trials()[0].kept, "{:?}", trainer.trials());
+        train(&mut trainer, 100);
+        let gains = |trainer: &mut SplatTrainer, ix: usize| trainer.calibrated_camera(&stepped[ix]).unwrap().gains[1];
+        let ratio = gains(&mut trainer, 17) / gains(&mut trainer, 19);
+        assert!((1.4..2.6).contains(&ratio), "{ratio}");
     }
 }
