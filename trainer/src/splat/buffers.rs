@@ -237,6 +237,8 @@ impl SplatBuffers {
 pub(crate) struct Scratch {
     pub(crate) n_entries: u32,
     pub(crate) capacity: Buffer,
+    /// The same without slots, so that pictures need no memory for gradients.
+    pub(crate) capacity_for_drawing: Buffer,
     pub(crate) projected_splats: Buffer,
     pub(crate) tile_counts: Buffer,
     pub(crate) touched: Buffer,
@@ -281,10 +283,11 @@ impl Scratch {
         let segment_bytes = 16 * (u64::from(n_segments[0]) + u64::from(n_segments[1]) + u64::from(n_of_tiles));
         let state_bytes = u64::from(4 * N_STATE_PARTS * 2 * STATE_PAIRS);
         let per_bin = |name: &str, n: u32| gpu.storage(name, 4 * u64::from(n_bins) * u64::from(n.max(1)));
+        let capacity = Capacity { n_entries, n_slots, n_segments: n_segments[0], unused: 0 };
         Ok(Self {
             n_entries,
-            capacity: gpu
-                .uniform_with("splat.capacity", &Capacity { n_entries, n_slots, n_segments: n_segments[0], unused: 0 }),
+            capacity: gpu.uniform_with("splat.capacity", &capacity),
+            capacity_for_drawing: gpu.uniform_with("splat.capacity_for_drawing", &Capacity { n_slots: 0, ..capacity }),
             projected_splats: gpu.storage("splat.projected_splats", 48 * u64::from(n_splats))?,
             tile_counts: words("splat.tile_counts", n_splats)?,
             touched: gpu.storage("splat.touched", 12 * u64::from(n_splats))?,

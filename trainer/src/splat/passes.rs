@@ -126,17 +126,23 @@ fn n_color_strips(size_px: [u32; 2]) -> u64 {
 }
 
 impl ViewPasses<'_> {
-    /// Projects, sorts, bins and rasterizes the splats.
+    /// Projects, sorts, bins and rasterizes the splats. Needs no memory for gradients.
     pub(crate) fn draw(&self, passes: &mut Passes, pipelines: &DrawPipelines) {
-        self.list(passes, pipelines);
+        self.list(passes, pipelines, &self.scratch.capacity_for_drawing);
         passes.dispatch(self.gpu, &pipelines.rasterize, u64::from(n_tiles(self.size_px)), &self.rasterized());
     }
 
     /// [`ViewPasses::draw`], followed by [`ViewPasses::backward`].
     pub(crate) fn draw_for_backward(&self, passes: &mut Passes, draw: &DrawPipelines, train: &TrainPipelines) {
-        let Some(rasterize) = &train.rasterize_segments else { return self.draw(passes, draw) };
-        self.list(passes, draw);
-        let buffers = [&self.rasterized()[..], &self.segments()].concat();
+        self.list(passes, draw, &self.scratch.capacity);
+        let mut buffers = self.rasterized();
+        let rasterize = match &train.rasterize_segments {
+            Some(rasterize) => {
+                buffers.extend(self.segments());
+                rasterize
+            }
+            None => &draw.rasterize,
+        };
         passes.dispatch(self.gpu, rasterize, u64::from(n_tiles(self.size_px)), &buffers);
     }
 
@@ -170,8 +176,8 @@ impl ViewPasses<'_> {
         ]
     }
 
-    /// Projects, sorts and bins the splats.
-    fn list(&self, passes: &mut Passes, pipelines: &DrawPipelines) {
+    /// Projects, sorts and bins the splats, if they fit into this capacity.
+    fn list(&self, passes: &mut Passes, pipelines: &DrawPipelines, capacity: &Buffer) {
         let Self { gpu, splats, scratch, status, view, size_px, .. } = *self;
         let n_blocks = u64::from(splats.n_splats.div_ceil(BLOCK));
         let [view, model] = [("view", view), ("model", &splats.model)];
@@ -221,7 +227,7 @@ impl ViewPasses<'_> {
         let allocated = [
             view,
             model,
-            ("capacity", &scratch.capacity),
+            ("capacity", capacity),
             bin_totals,
             bin_starts,
             block_slots,

@@ -48,7 +48,7 @@ impl SplatTrainer {
                 view.contribute(passes, learn, &contributions); // Has no effect if a buffer was too small.
                 passes.submit(gpu);
                 let counters: Vec<u32> = gpu.read(&optimizer.status, status::LEN)?;
-                if !self.renderer.grow_scratch(&mut self.recorder, &counters)? {
+                if !self.renderer.grow_scratch(&mut self.recorder, &counters, true)? {
                     break;
                 }
                 self.optimizer.clear_failure(&self.recorder.gpu);

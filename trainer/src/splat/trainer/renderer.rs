@@ -156,7 +156,7 @@ impl Renderer {
             if let Some(taken) = taken {
                 return Ok(taken);
             }
-            if !self.grow_scratch(recorder, &counters)? {
+            if !self.grow_scratch(recorder, &counters, false)? {
                 return Err(Error::DeviceLost);
             }
             clear_failure(&recorder.gpu, &self.status);
@@ -224,9 +224,14 @@ impl Renderer {
         self.reserve(recorder, ScratchSize { n_splats: capacity, n_entries, n_slots, ..have })
     }
 
-    /// Grows the scratch buffers if the submit failed, beyond the need if memory permits. Returns whether the submit
-    /// failed.
-    pub(super) fn grow_scratch(&mut self, recorder: &mut Recorder, counters: &[u32]) -> Result<bool, Error> {
+    /// Grows the scratch buffers if the submit failed, beyond the need if memory permits; those for gradients only if
+    /// `learned`. Returns whether the submit failed.
+    pub(super) fn grow_scratch(
+        &mut self,
+        recorder: &mut Recorder,
+        counters: &[u32],
+        learned: bool,
+    ) -> Result<bool, Error> {
         if counters[status::FAILED] == 0 {
             return Ok(false);
         }
@@ -239,7 +244,7 @@ impl Renderer {
             };
             let need = ScratchSize {
                 n_entries: larger(counters[status::NEED_ENTRIES], size.n_entries),
-                n_slots: if size.n_slots == 0 { 0 } else { larger(counters[status::NEED_SLOTS], size.n_slots) },
+                n_slots: if learned { larger(counters[status::NEED_SLOTS], size.n_slots) } else { size.n_slots },
                 ..size
             };
             log::debug!("splat: growing the intersection buffers to {need:?}");

@@ -172,7 +172,7 @@ impl SplatTrainer {
     pub(super) fn finish_in_flight(&mut self) -> Result<bool, Error> {
         let Some(counters) = self.optimizer.submits.finish(&self.recorder.gpu)? else { return Ok(false) };
         self.optimizer.log_non_finite(counters[status::N_NON_FINITE].into());
-        let grown = self.renderer.grow_scratch(&mut self.recorder, &counters);
+        let grown = self.renderer.grow_scratch(&mut self.recorder, &counters, true);
         if matches!(grown, Ok(false)) {
             return Ok(false);
         }
@@ -236,7 +236,7 @@ mod tests {
     use super::*;
     use crate::Method;
     use crate::gpu::{Gpu, GpuOptions};
-    use crate::splat::training_tests::{n_keyframes, options, train};
+    use crate::splat::training_tests::{n_keyframes, options, request, train};
     use keyframe::{Keyframe, Split};
     use std::sync::Arc;
 
@@ -279,6 +279,8 @@ mod tests {
         assert!(trainer.skipped.n_consecutive > 0, "the buffers were large enough for all images");
         assert!(trainer.model.is_full() && trainer.model.splats.n_splats == n_splats, "the model still grows");
         assert!(trainer.arrays().unwrap().checked().is_ok(), "a parameter is not finite");
+        // Pictures need no gradients, so even the covered view can be drawn.
+        trainer.render(&request(covered.world_from_camera)).unwrap();
     }
 
     #[test]
