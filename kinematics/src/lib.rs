@@ -32,6 +32,7 @@ pub mod chain;
 pub mod clock;
 mod error;
 pub mod history;
+mod inverse;
 pub mod joints;
 mod lens;
 mod polynomial;
