@@ -139,7 +139,10 @@ fn estimate(a: &[PoseSample], b: &[PoseSample], options: &TimeOffsetOptions) -> 
             "check that both streams are poses of the bodies (reference_from_body), not their inverses",
         )));
     }
-    if let Some(most) = options.max_offset_secs.filter(|most| offset_secs.abs() > most + coarse.step_secs) {
+    // An offset at the limit may exceed it by its error.
+    const MAX_SIGMAS: f64 = 3.0;
+    let is_beyond = |most: &f64| offset_secs.abs() > most + MAX_SIGMAS * fine.sigma_secs;
+    if let Some(most) = options.max_offset_secs.filter(is_beyond) {
         return Err(refused(Refusal::new(
             format!("the offset is {offset_secs:.3} s, which is more than the largest offset to search ({most} s)"),
             "search larger offsets",

@@ -242,6 +242,21 @@ fn quaternions_in_another_order_are_named() {
 }
 
 #[test]
+fn offsets_beyond_the_limit_are_refused() {
+    let (a, b) = streams(6, 0.001, 0.0);
+    let within = |most: f64| {
+        let options = TimeOffsetOptions { max_offset_secs: Some(most), ..TimeOffsetOptions::default() };
+        estimate_time_offset(&a, &b, &options)
+    };
+    // Half of the time between two poses beyond the limit.
+    let refused = refusal(within(TRUE_OFFSET_SECS - 0.005));
+    assert!(refused.why.contains("more than the largest offset to search"), "{refused}");
+    for most in [TRUE_OFFSET_SECS, TRUE_OFFSET_SECS + 0.005] {
+        assert!((within(most).unwrap().offset_secs - TRUE_OFFSET_SECS).abs() < 2e-3, "{most}");
+    }
+}
+
+#[test]
 fn small_limits_and_single_wrong_stamps_are_named() {
     let (a, mut b) = streams(6, 0.001, 0.0);
     let options = TimeOffsetOptions { max_offset_secs: Some(0.001), ..TimeOffsetOptions::default() };
