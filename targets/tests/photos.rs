@@ -56,6 +56,15 @@ fn wrong_counts_are_named_in_photos() {
 }
 
 #[test]
+fn parts_of_larger_boards_are_not_accepted() {
+    let Some(folder) = folder("chessboard") else { return };
+    for spec in ["chessboard:8x6:25mm", "chessboard:9x5:25mm", "chessboard:7x5:25mm"] {
+        let parts = detected_parts(spec, &folder);
+        assert!(parts.len() > 10 && parts.iter().all(|part| *part == 0.0), "{spec}: {parts:?}");
+    }
+}
+
+#[test]
 fn small_charuco_boards_are_found() {
     let Some(folder) = folder("arm_scan") else { return };
     let parts = detected_parts("charuco:9x6:40mm:35mm:4X4_250", &folder.join("images"));

@@ -72,6 +72,8 @@ pub(super) fn detect(
                 let pixels = lattice.corners.iter().filter_map(|(&cell, &pixel)| Some((id(cell)?, pixel)));
                 return Ok(target.detection(pixels, false));
             }
+            // At another resolution, a part of a larger board may look like this one.
+            Err(reason @ NotDetected::OtherSize { .. }) if is_complete_and_larger(&grid, inner) => return Err(reason),
             Err(reason) if grid.corners.len() > n_best => {
                 n_best = grid.corners.len();
                 failure = reason;
@@ -80,6 +82,16 @@ pub(super) fn detect(
         }
     }
     Err(failure)
+}
+
+/// Whether almost all corners of a larger grid were found.
+fn is_complete_and_larger(grid: &Lattice, inner: [u32; 2]) -> bool {
+    const MIN_PERCENT: usize = 95;
+    let Some([low, high]) = grid.range() else { return false };
+    let size = [high[0] - low[0] + 1, high[1] - low[1] + 1].map(i32::cast_unsigned);
+    let is_larger = |size: [u32; 2]| size[0] >= inner[0] && size[1] >= inner[1] && size != inner;
+    let n = (size[0] * size[1]) as usize;
+    (is_larger(size) || is_larger([size[1], size[0]])) && grid.corners.len() * 100 >= n * MIN_PERCENT
 }
 
 /// Refines a grid and renumbers its corners as those of the board.
