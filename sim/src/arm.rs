@@ -1,6 +1,7 @@
-//! The moving arm: MuJoCo's dynamics, and a controller that follows the scan at 1 kHz.
+//! The moving arm: MuJoCo's dynamics, and a controller that follows the scan or commands at 1 kHz.
 
 use crate::Error;
+use crate::commands::Commands;
 use crate::config::N_JOINTS;
 use crate::follower::Follower;
 use crate::panda::{self, Joints};
@@ -24,10 +25,54 @@ pub(crate) struct JointReading {
     pub(crate) torque_nm: Joints,
 }
 
+/// What the controller follows.
+enum Reference {
+    Scan(Follower),
+    Commands(JointCommands),
+}
+
+/// Commands in the order and with the offsets of the joint readings.
+struct JointCommands {
+    commands: Commands,
+    /// Joint index of each value of a reading.
+    joint_ixs: Vec<usize>,
+    /// Added to reported positions to get the true ones; empty if there are none.
+    joint_offsets: Vec<f64>,
+    position_rad: Joints,
+    velocity_rad_s: Joints,
+}
+
+impl JointCommands {
+    fn advance(&mut self) {
+        let setpoint = self.commands.next_setpoint();
+        for (value_ix, joint_ix) in self.joint_ixs.iter().enumerate() {
+            let offset = self.joint_offsets.get(value_ix).copied().unwrap_or(0.0);
+            self.position_rad[*joint_ix] = setpoint.position[value_ix] + offset;
+            self.velocity_rad_s[*joint_ix] = setpoint.velocity[value_ix];
+        }
+    }
+}
+
+impl Reference {
+    fn position_rad(&self) -> &Joints {
+        match self {
+            Self::Scan(follower) => follower.position_rad(),
+            Self::Commands(commands) => &commands.position_rad,
+        }
+    }
+
+    fn velocity_rad_s(&self) -> &Joints {
+        match self {
+            Self::Scan(follower) => follower.velocity_rad_s(),
+            Self::Commands(commands) => &commands.velocity_rad_s,
+        }
+    }
+}
+
 /// The arm with its controller and its recent readings.
 pub(crate) struct Arm {
     data: MjData<Arc<MjModel>>,
-    follower: Follower,
+    reference: Reference,
     n_steps: i64,
     readings: VecDeque<JointReading>,
     history_duration_nanos: i64,
@@ -42,19 +87,40 @@ impl Arm {
         }
         data.qpos_mut().copy_from_slice(follower.position_rad().as_slice());
         data.forward();
-        Ok(Self { data, follower, n_steps: 0, readings: VecDeque::new(), history_duration_nanos })
+        let reference = Reference::Scan(follower);
+        Ok(Self { data, reference, n_steps: 0, readings: VecDeque::new(), history_duration_nanos })
+    }
+
+    /// Position of the joints.
+    pub(crate) fn position_rad(&self) -> Joints {
+        Joints::from_column_slice(self.data.qpos())
+    }
+
+    /// Follows commands from now on, starting at rest at the current position. `joint_ixs` and `joint_offsets` are those
+    /// of the joint readings.
+    pub(crate) fn follow_commands(&mut self, commands: Commands, joint_ixs: &[usize], joint_offsets: &[f64]) {
+        self.reference = Reference::Commands(JointCommands {
+            commands,
+            joint_ixs: joint_ixs.to_vec(),
+            joint_offsets: joint_offsets.to_vec(),
+            position_rad: self.position_rad(),
+            velocity_rad_s: Joints::zeros(),
+        });
     }
 
     /// Reads the joints, then advances by one step.
     pub(crate) fn step(&mut self) -> JointReading {
-        let position_rad = Joints::from_column_slice(self.data.qpos());
+        let position_rad = self.position_rad();
         let velocity_rad_s = Joints::from_column_slice(self.data.qvel());
         let torque_nm = self.control(&position_rad, &velocity_rad_s);
         let reading = JointReading { nanos: self.n_steps * STEP_NANOS, position_rad, velocity_rad_s, torque_nm };
         self.data.qfrc_applied_mut().copy_from_slice(torque_nm.as_slice());
         self.data.step();
         self.n_steps += 1;
-        self.follower.advance(self.n_steps as f64 * STEP_SECS, STEP_SECS);
+        match &mut self.reference {
+            Reference::Scan(follower) => follower.advance(self.n_steps as f64 * STEP_SECS, STEP_SECS),
+            Reference::Commands(commands) => commands.advance(),
+        }
         self.readings.push_back(reading);
         while self.readings.front().is_some_and(|first| first.nanos + self.history_duration_nanos < reading.nanos) {
             self.readings.pop_front();
@@ -62,16 +128,16 @@ impl Arm {
         reading
     }
 
-    /// Gravity compensation, plus spring and damper torques toward the joint positions of the scan.
+    /// Gravity compensation, plus spring and damper torques toward the reference.
     fn control(&self, position_rad: &Joints, velocity_rad_s: &Joints) -> Joints {
-        let position_error = self.follower.position_rad() - position_rad;
-        let velocity_error = self.follower.velocity_rad_s() - velocity_rad_s;
+        let position_error = self.reference.position_rad() - position_rad;
+        let velocity_error = self.reference.velocity_rad_s() - velocity_rad_s;
         let bias = self.data.qfrc_bias();
         Joints::from_fn(|ix, _| {
             let torque = bias[ix]
                 + STIFFNESS[ix] * position_error[ix]
                 + DAMPING[ix] * velocity_error[ix]
-                + self.follower.velocity_rad_s()[ix];
+                + self.reference.velocity_rad_s()[ix];
             torque.clamp(-panda::MAX_TORQUE_NM[ix], panda::MAX_TORQUE_NM[ix])
         })
     }

@@ -54,8 +54,26 @@ pub struct TargetConfig {
     pub name: String,
     /// Specification, such as `charuco:5x7:34mm:26mm:5X5_100`.
     pub spec: String,
+    /// Frame that the board is attached to.
+    pub parent: TargetParent,
     /// Pose of the board frame: x points right on the print, y down, z into the plate.
-    pub world_from_board: Transform,
+    pub parent_from_board: Transform,
+}
+
+/// Frame that a printed target is attached to.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum TargetParent {
+    /// The world: the target is stationary.
+    World,
+    /// The arm's flange: the arm carries the target.
+    Flange,
+}
+
+impl Config {
+    /// Whether the arm carries a target, so that images of all cameras depend on its joints.
+    pub(crate) fn has_carried_target(&self) -> bool {
+        self.targets.iter().any(|target| target.parent == TargetParent::Flange)
+    }
 }
 
 impl TargetConfig {
@@ -416,7 +434,10 @@ impl Config {
         }
         for target in &self.targets {
             target.target()?;
-            check_pose(&target.name, "world_from_board", &target.world_from_board)?;
+            check_pose(&target.name, "parent_from_board", &target.parent_from_board)?;
+            if target.parent == TargetParent::Flange && !self.scene.has_arm() {
+                return Err(Error::TargetWithoutFlange { target: target.name.clone() });
+            }
         }
         Ok(())
     }
@@ -520,7 +541,8 @@ mod tests {
         assert!(matches!(config.check(), Err(Error::DuplicateName { .. })));
         config = Config::default();
         let (name, spec) = ("wall".to_owned(), "chessboard:9x6:25".to_owned());
-        config.targets.push(TargetConfig { name, spec, world_from_board: Transform::identity() });
+        let parent_from_board = Transform::identity();
+        config.targets.push(TargetConfig { name, spec, parent: TargetParent::World, parent_from_board });
         let message = config.check().expect_err("no unit").to_string();
         assert!(message.contains("wall") && message.contains("no unit"), "{message}");
     }

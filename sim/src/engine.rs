@@ -3,6 +3,7 @@
 use crate::arm::{JointReading, STEP_NANOS};
 use crate::base::Drift;
 use crate::cabinet_tour::light_frac;
+use crate::commands::Commands;
 use crate::config::{CameraConfig, Config, Parent, Scene, SensorConfig, StampConfig};
 use crate::lidar::{self, RayCaster};
 use crate::noise;
@@ -36,6 +37,8 @@ pub(crate) struct Engine {
     renderer: Renderer,
     /// Stamp of simulated time zero.
     start: Stamp,
+    /// Whether the robot moves ahead of its samples while images are rendered.
+    looks_ahead: bool,
     /// Maximum number of images being rendered; the engine waits for the oldest before it submits more.
     max_pending: usize,
     /// Images that would arrive before this simulated time are skipped. Set by the real-time loop when it is late.
@@ -175,9 +178,9 @@ impl Camera {
     }
 
     /// View of the depth sensor, if it is separate from the color sensor.
-    fn depth_view(&self, world_from_camera: &Transform) -> Option<render::View> {
+    fn depth_view(&self, world_from_camera: &Transform, robot: Option<RobotPose>) -> Option<render::View> {
         let sensor = self.config.depth.as_ref()?.sensor.as_ref()?;
-        Some(self.depth_optics.as_ref()?.view(world_from_camera * sensor.camera_from_depth, None, 1.0))
+        Some(self.depth_optics.as_ref()?.view(world_from_camera * sensor.camera_from_depth, robot, 1.0))
     }
 
     fn random(&self, seed: u64, image_ix: u64, stream: u64) -> RandomStream {
@@ -231,6 +234,7 @@ impl Engine {
             cameras: cameras.0,
             renderer,
             start: Stamp(0),
+            looks_ahead: true,
             max_pending: 2,
             skip_before_nanos: i64::MIN,
             slots: VecDeque::new(),
@@ -243,6 +247,22 @@ impl Engine {
 
     pub(crate) fn renderer_name(&self) -> &str {
         self.renderer.name()
+    }
+
+    /// The joint positions that the arm reports now.
+    pub(crate) fn reported_joints(&mut self) -> Result<Vec<f64>, Error> {
+        let position_rad = self.robot.arm_mut().ok_or(Error::NoArm)?.position_rad();
+        let zero = Joints::zeros();
+        let reading = JointReading { nanos: 0, position_rad, velocity_rad_s: zero, torque_nm: zero };
+        Ok(self.joint_state(&reading).position)
+    }
+
+    /// Moves the arm by commands instead of the scan.
+    pub(crate) fn follow_commands(&mut self, commands: Commands) -> Result<(), Error> {
+        let arm = self.robot.arm_mut().ok_or(Error::NoArm)?;
+        arm.follow_commands(commands, &self.joint_ixs, &self.config.joint_offsets);
+        self.looks_ahead = false;
+        Ok(())
     }
 
     /// Sets the stamp of simulated time zero. Call before taking the first sample.
@@ -261,7 +281,12 @@ impl Engine {
             if let Some(delivery) = self.ready.pop_front() {
                 return Ok(Some(delivery));
             }
-            while self.n_pending < self.max_pending && !self.has_ended {
+            // Commands apply to the samples that follow them, so the robot must not be ahead of its samples.
+            let is_due = |engine: &Self| match engine.looks_ahead {
+                true => engine.n_pending < engine.max_pending,
+                false => engine.slots.is_empty(),
+            };
+            while is_due(self) && !self.has_ended {
                 self.step()?;
             }
             match self.slots.pop_front() {
@@ -361,16 +386,17 @@ impl Engine {
             let world_from_row = camera.world_from_camera(&robot_at(stamp_nanos + offset)?);
             row_motions.push(RowMotion::new(&(camera_from_world * world_from_row)));
         }
-        // Images of cameras on the robot omit the robot and its shadow.
-        let robot = (camera.config.parent == Parent::World).then_some(robot);
+        // Images of cameras on the robot omit the robot and its shadow, but not a target that it carries.
+        let is_robot_visible = camera.config.parent == Parent::World;
+        let robot = (is_robot_visible || self.config.has_carried_target()).then_some(robot);
         let light_frac = match self.config.scene {
             Scene::MobileArm if !self.config.ideal && camera.config.parent == Parent::Flange => {
                 light_frac(&world_from_camera, self.config.light_inside_frac)
             }
             _ => 1.0,
         };
-        let view: render::View = camera.optics.view(world_from_camera, robot, light_frac);
-        let depth_view = camera.depth_view(&world_from_camera);
+        let view = render::View { is_robot_visible, ..camera.optics.view(world_from_camera, robot, light_frac) };
+        let depth_view = camera.depth_view(&world_from_camera, robot.filter(|_| self.config.has_carried_target()));
         let n_skipped = std::mem::take(&mut camera.n_skipped);
         let picture = self.renderer.submit(view)?;
         let depth_picture = depth_view.map(|view| self.renderer.submit(view)).transpose()?;

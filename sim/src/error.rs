@@ -43,11 +43,26 @@ pub enum Error {
         /// Name of the camera.
         camera: String,
     },
+    /// The robot of the scene has no arm to move.
+    #[error("the robot of this scene has no arm")]
+    NoArm,
+    /// The arm cannot be moved within the given limits.
+    #[error("the simulated arm cannot be moved: {reason}")]
+    Motion {
+        /// Cause.
+        reason: String,
+    },
     /// Two cameras have the same name.
     #[error("two cameras are named {camera:?}")]
     DuplicateName {
         /// The name.
         camera: String,
+    },
+    /// A target is attached to the flange of a robot without an arm.
+    #[error("{target} is on the flange, but the robot of this scene has no arm: give world_from_board")]
+    TargetWithoutFlange {
+        /// Name of the target in the rig file.
+        target: String,
     },
     /// The specification of a printed target is invalid.
     #[error("sim.target.{target}.spec: {source}; correct this key in the rig file")]

@@ -1,7 +1,8 @@
 //! Simulated rigs in MuJoCo, behind the traits of `drivers`.
 //!
 //! [`open`] builds a rig. [`Rig::into_lockstep`] runs it as fast as the caller takes samples; the same seed gives
-//! bit-identical samples. [`Rig::into_live`] runs it in real time as devices.
+//! bit-identical samples. [`Rig::into_live`] runs it in real time as devices. [`Rig::into_commanded`] gives an arm that
+//! moves by commands.
 //!
 //! ```no_run
 //! use sim::Config;
@@ -18,6 +19,8 @@ mod arm;
 mod base;
 mod cabinet;
 mod cabinet_tour;
+mod commanded;
+mod commands;
 pub mod config;
 mod egl;
 mod engine;
@@ -56,9 +59,10 @@ pub mod layout {
     };
 }
 
+pub use commanded::CommandedRig;
 pub use config::{
     BaseConfig, CameraConfig, Config, DepthConfig, DepthSensor, Parent, ScannerConfig, Scene, SensorConfig,
-    StampConfig, TargetConfig,
+    StampConfig, TargetConfig, TargetParent,
 };
 pub use error::Error;
 pub use live::{LiveRig, LiveTruth};

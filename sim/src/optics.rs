@@ -111,7 +111,7 @@ impl Optics {
         self.view_size_px
     }
 
-    /// The view to render for a pose.
+    /// The view to render for a pose. The robot is not drawn.
     pub(crate) fn view(&self, world_from_camera: Transform, robot: Option<RobotPose>, light_frac: f64) -> View {
         View {
             size_px: self.view_size_px,
@@ -119,6 +119,7 @@ impl Optics {
             principal_px: self.view_principal_px,
             world_from_camera,
             robot,
+            is_robot_visible: false,
             light_frac,
         }
     }

@@ -67,7 +67,7 @@ fn png(picture: &Raster) -> Result<Vec<u8>, image::ImageError> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{CameraConfig, Config, SensorConfig, layout};
+    use crate::{CameraConfig, Config, SensorConfig, TargetParent, layout};
     use drivers::{Sample, Source, TruthImage};
     use kinematics::Transform;
     use nalgebra::Rotation3;
@@ -92,7 +92,12 @@ mod tests {
             ideal: true,
             n_images: Some(6),
             cameras: vec![camera],
-            targets: vec![TargetConfig { name: "board".to_owned(), spec: spec.to_owned(), world_from_board }],
+            targets: vec![TargetConfig {
+                name: "board".to_owned(),
+                spec: spec.to_owned(),
+                parent: TargetParent::World,
+                parent_from_board: world_from_board,
+            }],
             ..Config::default()
         };
         let rig = crate::open(&config).expect("a scene");

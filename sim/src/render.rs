@@ -21,8 +21,10 @@ pub(crate) struct View {
     pub(crate) focal_px: [f64; 2],
     pub(crate) principal_px: [f64; 2],
     pub(crate) world_from_camera: Transform,
-    /// Pose of the robot. If `None`, the robot is not drawn and casts no shadow.
+    /// Pose of the robot; `None` if nothing in the image depends on it.
     pub(crate) robot: Option<RobotPose>,
+    /// Whether the robot is drawn and casts a shadow.
+    pub(crate) is_robot_visible: bool,
     /// Brightness of all lamps; 1 is nominal.
     pub(crate) light_frac: f64,
 }
@@ -36,6 +38,7 @@ impl View {
             principal_px: [8.0; 2],
             world_from_camera: Transform::identity(),
             robot: None,
+            is_robot_visible: false,
             light_frac: 1.0,
         }
     }
@@ -157,7 +160,7 @@ struct Canvas {
 impl Canvas {
     fn draw(&mut self, view: &View) -> Picture {
         let mut options = MjvOption::default();
-        options.geomgroup[ARM_GROUP] = view.robot.is_some().into();
+        options.geomgroup[ARM_GROUP] = view.is_robot_visible.into();
         if let Some(robot) = &view.robot {
             if let Some(joints_rad) = &robot.joints_rad {
                 self.data.qpos_mut().copy_from_slice(joints_rad.as_slice());

@@ -3,6 +3,7 @@
 use crate::arm::Arm;
 use crate::base::{BaseMotion, base_from_arm};
 use crate::cabinet_tour::CabinetTour;
+use crate::commanded::CommandedRig;
 use crate::config::{Config, Parent, Scene};
 use crate::engine::{Cameras, Engine, history_nanos};
 use crate::follower::{Follower, Tour};
@@ -13,6 +14,7 @@ use crate::rig_info::{CameraInfo, RigInfo};
 use crate::robot::Robot;
 use crate::scan::Scan;
 use crate::{CameraConfig, Error, scene};
+use drivers::motion::MotionLimits;
 use kinematics::{Stamp, Transform};
 use std::sync::Arc;
 
@@ -101,6 +103,12 @@ impl Rig {
     /// Runs as fast as samples are taken. Simulated time zero has the stamp 0.
     pub fn into_lockstep(self) -> Lockstep {
         Lockstep::new(self.engine, self.info)
+    }
+
+    /// Runs as fast as its devices are read, with an arm that moves by commands within the given limits, which are in the
+    /// order of the joint readings. Simulated time zero has the stamp 0.
+    pub fn into_commanded(self, limits: &[MotionLimits]) -> Result<CommandedRig, Error> {
+        CommandedRig::new(self.engine, self.info, limits)
     }
 
     /// Runs in real time. Simulated time zero is now, which is `start` on the caller's clock.

@@ -39,6 +39,11 @@ impl Robot {
         &self.motion
     }
 
+    /// The arm, if there is one.
+    pub(crate) fn arm_mut(&mut self) -> Option<&mut Arm> {
+        self.arm.as_mut()
+    }
+
     /// Advances by one step. Returns the time before the step, nanoseconds, and the joint reading at that time.
     pub(crate) fn step(&mut self) -> (i64, Option<JointReading>) {
         let nanos = self.n_steps * STEP_NANOS;

@@ -1,7 +1,7 @@
 //! Builds the MuJoCo model of a scene and its robot.
 
 use crate::base;
-use crate::config::{Config, Parent, Scene};
+use crate::config::{Config, Parent, Scene, TargetParent};
 use crate::objects::{self, Object};
 use crate::texture::Texture;
 use crate::{Error, cabinet, lab, light, panda, printed_target};
@@ -59,9 +59,10 @@ pub(crate) fn build(config: &Config, largest_px: [u32; 2]) -> Result<MjModel, Er
         let _ =
             writeln!(bodies, "<geom type=\"mesh\" mesh=\"{name}\" material=\"{material}\" group=\"{group}\" {pose}/>");
     }
+    let mut on_flange = String::new();
     for (ix, target) in config.targets.iter().enumerate() {
         let printed_target::Printed { png, mesh, plate } = printed_target::print(target)?;
-        let (name, pose) = (format!("target{ix}"), panda::pose_attributes(&target.world_from_board));
+        let (name, pose) = (format!("target{ix}"), panda::pose_attributes(&target.parent_from_board));
         add_file(&mut files, &format!("{name}.png"), &png)?;
         add_file(&mut files, &format!("{name}.msh"), &mesh.to_msh())?;
         add_file(&mut files, &format!("{name}_plate.msh"), &plate.to_msh())?;
@@ -72,16 +73,21 @@ pub(crate) fn build(config: &Config, largest_px: [u32; 2]) -> Result<MjModel, Er
              <mesh name=\"{name}\" file=\"{name}.msh\" inertia=\"shell\"/>\n\
              <mesh name=\"{name}_plate\" file=\"{name}_plate.msh\" inertia=\"shell\"/>"
         );
+        let parent = match target.parent {
+            TargetParent::World => &mut bodies,
+            TargetParent::Flange => &mut on_flange,
+        };
+        // Visible even if the arm is hidden, and without mass.
         let _ = writeln!(
-            bodies,
-            "<geom type=\"mesh\" mesh=\"{name}\" material=\"{name}\" {pose}/>\n\
-             <geom type=\"mesh\" mesh=\"{name}_plate\" material=\"frame\" {pose}/>"
+            parent,
+            "<geom type=\"mesh\" mesh=\"{name}\" material=\"{name}\" group=\"0\" mass=\"0\" {pose}/>\n\
+             <geom type=\"mesh\" mesh=\"{name}_plate\" material=\"frame\" group=\"0\" mass=\"0\" {pose}/>"
         );
     }
     let [near, far] = near_far_m(config.scene);
     let [width, height] = largest_px;
     let (lamps, ambient) = light::mjcf(brightness(config.scene));
-    let robot = robot(config);
+    let robot = robot(config, &on_flange);
     let xml = format!(
         "<mujoco model=\"{}\">\n\
          <compiler angle=\"radian\" autolimits=\"true\"/>\n\
@@ -104,8 +110,8 @@ pub(crate) fn build(config: &Config, largest_px: [u32; 2]) -> Result<MjModel, Er
 }
 
 /// MJCF body of the robot: an arm alone, or a base with or without an arm.
-fn robot(config: &Config) -> String {
-    let arm = if config.scene.has_arm() { panda::mjcf(&brackets(config)) } else { String::new() };
+fn robot(config: &Config, on_flange: &str) -> String {
+    let arm = if config.scene.has_arm() { panda::mjcf(&(brackets(config) + on_flange)) } else { String::new() };
     if !config.scene.has_moving_base() {
         return arm;
     }

@@ -43,8 +43,10 @@ keys! {
     pub struct SimTarget {
         /// Specification of the target. The simulator checks it.
         pub spec: String, required "the target, such as \"charuco:5x7:34mm:26mm:5X5_100\"";
-        /// Pose of the board frame: x points right on the print, y down, z into the board.
-        pub world_from_board: Transform = Transform::identity();
+        /// Pose of the board frame: x points right on the print, y down, z into the board. `None` on the flange.
+        pub world_from_board: Option<Transform>;
+        /// The same relative to the flange, for a board that the arm carries.
+        pub flange_from_board: Option<Transform>;
     }
 }
 

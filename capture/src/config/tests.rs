@@ -69,6 +69,8 @@ camera_from_depth = { xyz_m = [0.0, 0.0, 0.1], quat_xyzw = [0.0, 0.0, 0.0, 1.0] 
 [arm.sim]
 [sim.target.board]
 spec = "charuco:5x7:34mm:26mm:5X5_100"
+world_from_board = { xyz_m = [0.0, 0.0, 0.0], quat_xyzw = [0.0, 0.0, 0.0, 1.0] }
+flange_from_board = { xyz_m = [0.0, 0.0, 0.1], quat_xyzw = [0.0, 0.0, 0.0, 1.0] }
 "#;
 
 fn parse(text: &str, overrides: &[Override]) -> Result<Rig, ConfigError> {
@@ -81,7 +83,7 @@ fn with(key: &'static str, value: &str) -> Result<Rig, ConfigError> {
 }
 
 /// Key, a valid value that differs from the current one, and an invalid value.
-const KEYS: [(&str, &str, &str); 179] = [
+const KEYS: [(&str, &str, &str); 181] = [
     ("arm.rate_hz", "500", "0"),
     ("arm.bus.can0.bitrate_hz", "500_000", "1"),
     ("arm.bus.can0.data_bitrate_hz", "5_000_000", "9_000_000"),
@@ -255,6 +257,8 @@ const KEYS: [(&str, &str, &str); 179] = [
     ("sim.target.board.spec", "'tag:36h11:5:100mm'", "5"),
     ("sim.target.board.world_from_board.xyz_m", "[1, 2, 3]", "[1, 2]"),
     ("sim.target.board.world_from_board.quat_xyzw", "[0, 1, 0, 0]", "[0, 0, 0, 0]"),
+    ("sim.target.board.flange_from_board.xyz_m", "[1, 2, 3]", "[1, 2]"),
+    ("sim.target.board.flange_from_board.quat_xyzw", "[0, 1, 0, 0]", "[0, 0, 0, 0]"),
     // The same settings as whole tables: a flag may also replace a table.
     ("base.world_from_base", "{ xyz_m = [1, 2, 3] }", "3"),
     ("range.lidar.base_from_scanner", "{ xyz_m = [1, 2, 3] }", "3"),

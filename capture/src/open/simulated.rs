@@ -102,14 +102,19 @@ fn config_of(rig: &Rig) -> crate::Result<sim::Config> {
             drift_rad: rig.base.sim.drift_rad,
         },
         light_inside_frac: rig.sim.light_inside_frac,
-        targets: rig.sim.targets.iter().map(target_of).collect(),
+        targets: rig.sim.targets.iter().map(target_of).collect::<crate::Result<_>>()?,
         cameras: rig.cameras.iter().filter(|camera| camera.driver == CameraDriver::Sim).map(camera_of).collect(),
     })
 }
 
-fn target_of((name, target): (&String, &SimTarget)) -> sim::TargetConfig {
-    let SimTarget { spec, world_from_board } = target.clone();
-    sim::TargetConfig { name: format!("sim.target.{name}"), spec, world_from_board }
+fn target_of((name, target): (&String, &SimTarget)) -> crate::Result<sim::TargetConfig> {
+    let (parent, parent_from_board) = match (target.world_from_board, target.flange_from_board) {
+        (Some(_), Some(_)) => bail!("sim.target.{name}: give either world_from_board or flange_from_board, not both"),
+        (None, Some(flange_from_board)) => (sim::TargetParent::Flange, flange_from_board),
+        (world_from_board, None) => (sim::TargetParent::World, world_from_board.unwrap_or_default()),
+    };
+    let (name, spec) = (format!("sim.target.{name}"), target.spec.clone());
+    Ok(sim::TargetConfig { name, spec, parent, parent_from_board })
 }
 
 fn scanner_of(scanner: &Scanner) -> sim::ScannerConfig {
