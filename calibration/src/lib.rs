@@ -47,8 +47,9 @@ pub use correction::{
 };
 pub use error::Error;
 pub use intrinsics::{
-    BoardPose, EstimatedParam, ImageFit, ImageGrid, IntrinsicsCalibration, IntrinsicsInput, LensModel, LensTrial,
-    NextView, PointFit, Rejected, RejectionReason, board_pose, calibrate_intrinsics,
+    BoardPose, EstimatedParam, ImageFit, ImageGrid, ImageRegion, IntrinsicsAdvice, IntrinsicsCalibration,
+    IntrinsicsGuidance, IntrinsicsInput, LensModel, LensTrial, NextView, PointFit, RECOMMENDED_IMAGES, Rejected,
+    RejectionReason, Side, board_pose, calibrate_intrinsics,
 };
 pub use params::ParamSet;
 pub use registration::{

@@ -7,6 +7,7 @@ mod bundle;
 mod check;
 mod coefficients;
 mod grid;
+mod guidance;
 pub(crate) mod homography;
 mod initial;
 mod next_view;
@@ -18,6 +19,7 @@ mod tests;
 
 pub use board_pose::{BoardPose, board_pose};
 pub use grid::ImageGrid;
+pub use guidance::{ImageRegion, IntrinsicsAdvice, IntrinsicsGuidance, RECOMMENDED_IMAGES, Side};
 pub use next_view::NextView;
 pub use report::{EstimatedParam, ImageFit, IntrinsicsCalibration, PointFit, Rejected, RejectionReason};
 pub use selection::LensTrial;
