@@ -9,6 +9,7 @@
 mod closed_form;
 mod consensus;
 mod corner_fit;
+mod error_sources;
 mod evaluation;
 mod excitation;
 mod geometry;

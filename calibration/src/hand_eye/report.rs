@@ -1,6 +1,7 @@
 //! Result of a hand-eye calibration: transforms, uncertainty, and errors per sample.
 
 use super::closed_form::ClosedForm;
+use super::error_sources;
 use super::evaluation::{self, Scatter};
 use super::geometry;
 use super::mistakes;
@@ -118,6 +119,12 @@ pub(super) fn report(
     let covariance = position_first(&refined.covariance.fixed_view::<6, 6>(0, 0).into_owned());
     let sigma = |first: usize| [0, 1, 2].map(|axis| sigma_of(covariance[(first + axis, first + axis)]));
     let mut samples = sample_reports(input, refined);
+    let rms_all_px = rms_px(input, refined, |_| Some(refined.solution));
+    let mut warnings = problems(input, refined, &samples);
+    // Contradicting intrinsics are the more precise explanation.
+    if refined.intrinsics_doubt.is_none() {
+        warnings.extend(error_sources::warning(&refined.noise, scatter, rms_all_px));
+    }
     debug_assert_eq!(refined.samples.len() + without_board.len() + repeated.len(), samples.len());
     for ix in repeated {
         samples[*ix].status = SampleStatus::Repeated;
@@ -131,7 +138,7 @@ pub(super) fn report(
         sigma_deg: sigma(3).map(f64::to_degrees),
         scatter,
         held_out_scatter: held_out.scatter,
-        rms_px: rms_px(input, refined, |_| Some(refined.solution)),
+        rms_px: rms_all_px,
         held_out_rms_px: held_out.rms_px,
         noise: refined.noise,
         closed_form: refined.closed_form,
@@ -141,7 +148,7 @@ pub(super) fn report(
             .filter(|_| input.options.estimate_intrinsics)
             .map(|intrinsics| (intrinsics, refined.intrinsics_sigma.clone())),
         joint_offsets: joint_offsets(input, refined),
-        warnings: warnings(input, refined, &samples),
+        warnings,
         samples,
         refined: refined.clone(),
     })
@@ -245,7 +252,7 @@ fn joint_offsets(input: &HandEyeInput<'_>, refined: &Refined) -> Vec<JointOffset
         .collect()
 }
 
-fn warnings(input: &HandEyeInput<'_>, refined: &Refined, reports: &[SampleReport]) -> Vec<String> {
+fn problems(input: &HandEyeInput<'_>, refined: &Refined, reports: &[SampleReport]) -> Vec<String> {
     let mut warnings: Vec<String> = refined.intrinsics_doubt.clone().into_iter().collect();
     let named = |status: SampleStatus| -> Vec<&str> {
         reports.iter().filter(|report| report.status == status).map(|report| report.name.as_str()).collect()
