@@ -3,6 +3,9 @@
 //! Images are kept while the robot is slow and at poses that differ from those of the images before. If the robot has no
 //! arm, images are kept at a fixed interval.
 
+#[cfg(test)]
+mod tests;
+
 use crate::config::{ArmDriver, Camera, Rig};
 use crate::open::{Opened, chain_of};
 use drivers::{Image, Sample};
@@ -74,7 +77,7 @@ pub struct CalibrationImages {
 ///
 /// * `max_shift_px`: maximum predicted image motion over readout, exposure and stamp uncertainty, for a scene at
 ///   `join.default_depth_m`. Images with more motion are not kept.
-/// * `on_image`: is called after each image, with the number of images kept.
+/// * `on_sample`: is called after each sample, with the images kept so far.
 ///
 /// # Errors
 ///
@@ -84,7 +87,7 @@ pub fn calibration_images(
     camera: &str,
     max_shift_px: f64,
     mut is_end: impl FnMut(&Sample) -> bool,
-    on_image: &dyn Fn(usize),
+    on_sample: &mut dyn FnMut(&[CalibrationImage]),
 ) -> crate::Result<CalibrationImages> {
     let Opened { rig, mut source, damage, .. } = opened;
     let mut reader = Reader::new(&rig, camera, max_shift_px)?;
@@ -93,10 +96,17 @@ pub fn calibration_images(
             break;
         }
         reader.push(sample);
-        on_image(reader.found.images.len());
+        on_sample(&reader.found.images);
     }
     reader.found.n_unusable += reader.waiting.len();
     Ok(CalibrationImages { damage: damage.get().cloned(), ..reader.found })
+}
+
+/// Gray values of an image, row by row. `None` if it does not decode.
+pub(crate) fn gray_of(image: &Image) -> Option<Vec<u8>> {
+    let [width, height] = image.size_px;
+    let rgb = RgbImage::from_raw(width, height, image.decode_rgb().ok()?)?;
+    Some(DynamicImage::from(rgb).into_luma8().into_raw())
 }
 
 struct Reader<'a> {
@@ -202,13 +212,10 @@ impl<'a> Reader<'a> {
             self.found.n_fast += 1;
             return;
         }
-        let [width, height] = image.size_px;
-        let rgb = image.decode_rgb().ok().and_then(|rgb| RgbImage::from_raw(width, height, rgb));
-        let Some(rgb) = rgb else {
+        let Some(gray) = gray_of(image) else {
             self.found.n_unusable += 1;
             return;
         };
-        let gray = DynamicImage::from(rgb).into_luma8().into_raw();
         self.found.images.push(CalibrationImage { secs, size_px: image.size_px, gray, arm });
     }
 

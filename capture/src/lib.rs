@@ -28,6 +28,7 @@
 //! # Ok::<(), capture::Error>(())
 //! ```
 
+mod arm_capture;
 mod calibration_images;
 pub mod config;
 pub mod dataset;
@@ -41,10 +42,12 @@ pub mod open;
 mod stamp_clock;
 mod stations;
 mod stop;
+mod supervised_arm;
 #[cfg(test)]
 #[path = "../../tests/common/test_data.rs"]
 mod test_data;
 
+pub use arm_capture::ArmCapture;
 pub use calibration_images::{ArmDuringImage, CalibrationImage, CalibrationImages, calibration_images};
 pub use config::{ConfigError, Override, Rig};
 pub use error::{Error, Result};
@@ -54,3 +57,4 @@ pub use nearest_name::nearest_name;
 pub use stamp_clock::StampClock;
 pub use stations::{StationReport, Stations};
 pub use stop::Stop;
+pub use supervised_arm::{MotionEnd, SupervisedArm};

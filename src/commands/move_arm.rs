@@ -2,23 +2,22 @@
 
 use crate::exit::{BadArgument, Exit};
 use crate::{print, signals};
-use anyhow::{Context, bail};
-use capture::config::Rig;
-use capture::{Stop, open};
-use drivers::motion::{JointTarget, Motion, OnLoss};
-use drivers::{Error, MovableArm, clock};
+use anyhow::bail;
+use capture::config::{ArmMotion, Rig};
+use capture::{Stop, SupervisedArm, open};
+use drivers::clock;
+use drivers::motion::{JointTarget, OnLoss};
 use indicatif::ProgressBar;
 use kinematics::{JointState, Stamp};
 use serde::Serialize;
 use std::path::PathBuf;
-use std::time::Duration;
 
 /// A target may exceed the joint range by this much, rad or m.
 const TOLERANCE_RAD: f64 = 1e-4;
-/// How often Ctrl-C is checked.
-const POLL: Duration = Duration::from_millis(50);
-/// A movable arm that reports nothing for this long counts as lost.
-const MAX_SILENCE: Duration = Duration::from_secs(2);
+
+/// What to do while an arm is held that its motors would release.
+pub(super) const HOLDING: &str =
+    "holding the arm; support it before you press Ctrl-C, because the motors then no longer hold it";
 
 /// Flags of `move`.
 #[derive(Debug, clap::Args)]
@@ -70,26 +69,19 @@ struct ArrivedEvent<'a> {
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let stop = signals::stop_on_signals()?;
     let rig = Rig::load(&args.rig_file, &[])?;
-    let Some(motion) = rig.arm.motion.as_ref() else {
-        return Err(BadArgument(
-            "the rig file has no table [arm.motion], so its arm is only read: see docs/guide/moving-arms.md".to_owned(),
-        )
-        .into());
-    };
+    let motion = motion_of(&rig)?;
     check(args, &rig)?;
-    let arm = open::movable_arm(&rig)?;
-    let mut offsets = rig.arm.joint_offsets.clone();
-    offsets.resize(rig.arm.joints.len(), 0.0);
-    let mut mover = Mover { arm, offsets, stop, bar: print::bar(None, "{spinner} {elapsed} {msg}", args.json) };
+    let mut arm = SupervisedArm::new(open::movable_arm(&rig)?, &rig);
+    let bar = print::bar(None, "{spinner} {elapsed} {msg}", args.json);
     if args.recover {
-        mover.arm.recover()?;
+        arm.recover()?;
         log::info!("the arm has recovered");
     }
-    let initial = mover.read()?;
+    let initial = arm.read()?;
     if args.to.is_some() || !args.by.is_empty() {
         let requested = target(args, &rig.arm.joints, &initial);
         check_range(&rig, &requested, &initial)?;
-        let target = mover.command(&requested)?;
+        let target = arm.command(&requested)?;
         for (joint, (requested, accepted)) in rig.arm.joints.iter().zip(requested.position.iter().zip(&target.position))
         {
             if (requested - accepted).abs() > TOLERANCE_RAD {
@@ -97,7 +89,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
             }
         }
         let began = clock::now();
-        let last = mover.follow(&target).inspect_err(|error| {
+        let last = follow(&mut arm, &target, &stop, &bar).inspect_err(|error| {
             if args.json {
                 // Output errors are ignored: the arm's error is returned.
                 let _ = print::report_json(&serde_json::json!({ "event": "stopped", "reason": format!("{error:#}") }));
@@ -106,11 +98,20 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         report_arrival(args, &rig.arm.joints, &target, &last, began)?;
     }
     if motion.on_loss != OnLoss::Hold && !args.exit_on_arrival {
-        log::info!("holding the arm; support it before you press Ctrl-C, because the motors then no longer hold it");
-        mover.hold()?;
+        log::info!("{HOLDING}");
+        arm.hold(&stop, |state| bar.set_message(format!("held at {}", format_positions(&state.position))))?;
     }
-    mover.bar.finish_and_clear();
+    bar.finish_and_clear();
     Ok(Exit::Done)
+}
+
+/// How the arm of a rig may be moved.
+pub(super) fn motion_of(rig: &Rig) -> Result<&ArmMotion, BadArgument> {
+    rig.arm.motion.as_ref().ok_or_else(|| {
+        BadArgument(
+            "the rig file has no table [arm.motion], so its arm is only read: see docs/guide/moving-arms.md".to_owned(),
+        )
+    })
 }
 
 /// Checks the arguments against the rig file, before any device is opened.
@@ -178,81 +179,18 @@ fn report_arrival(
     Ok(())
 }
 
+/// Waits until the arm arrives. Ctrl-C stops the arm and returns an error.
+fn follow(arm: &mut SupervisedArm, target: &JointTarget, stop: &Stop, bar: &ProgressBar) -> anyhow::Result<JointState> {
+    let target = format_positions(&target.position);
+    let end = arm.follow(stop, |state| {
+        bar.set_message(format!("at {} of {target}", format_positions(&state.position)));
+    })?;
+    if !end.has_arrived {
+        bail!("stopped before the target, at {}", format_positions(&end.state.position));
+    }
+    Ok(end.state)
+}
+
 fn format_positions(position: &[f64]) -> String {
     position.iter().map(|position| format!("{position:.4}")).collect::<Vec<_>>().join(", ")
-}
-
-/// The arm and the state for supervising it.
-struct Mover {
-    arm: Box<dyn MovableArm>,
-    /// Joint offsets, added to the reported positions as in all other commands.
-    offsets: Vec<f64>,
-    stop: Stop,
-    bar: ProgressBar,
-}
-
-impl Mover {
-    /// Reads the next joint state. Fails if the arm has stopped on its own or reports nothing.
-    fn read(&mut self) -> anyhow::Result<JointState> {
-        let deadline = clock::now().plus_secs(MAX_SILENCE.as_secs_f64());
-        loop {
-            let state = self.arm.read(POLL);
-            if let Motion::Stopped { reason } = self.arm.motion() {
-                bail!("the arm stopped: {reason}. Inspect it, then recover it with --recover");
-            }
-            match state {
-                Err(Error::NoJoints { .. }) if clock::now() < deadline => {}
-                state => {
-                    let mut state = state?;
-                    state.position.iter_mut().zip(&self.offsets).for_each(|(position, offset)| *position += offset);
-                    return Ok(state);
-                }
-            }
-        }
-    }
-
-    /// Sends a target; returns it as clamped to the limits.
-    fn command(&mut self, requested: &JointTarget) -> Result<JointTarget, Error> {
-        let with_offsets = |target: &JointTarget, sign: f64| JointTarget {
-            position: target
-                .position
-                .iter()
-                .zip(&self.offsets)
-                .map(|(position, offset)| position + sign * offset)
-                .collect(),
-        };
-        let accepted = self.arm.command(&with_offsets(requested, -1.0))?;
-        Ok(with_offsets(&accepted, 1.0))
-    }
-
-    /// Waits until the arm arrives. Ctrl-C stops the arm and returns an error.
-    fn follow(&mut self, target: &JointTarget) -> anyhow::Result<JointState> {
-        loop {
-            let state = self.read()?;
-            if self.arm.motion() == Motion::Holding {
-                return Ok(state);
-            }
-            self.bar.set_message(format!(
-                "at {} of {}",
-                format_positions(&state.position),
-                format_positions(&target.position)
-            ));
-            if self.stop.requested() {
-                self.arm.stop().context("cannot stop the arm")?;
-                while self.arm.motion() == Motion::Moving {
-                    self.read()?;
-                }
-                bail!("stopped before the target, at {}", format_positions(&self.read()?.position));
-            }
-        }
-    }
-
-    /// Holds the arm in place until Ctrl-C.
-    fn hold(&mut self) -> anyhow::Result<()> {
-        while !self.stop.requested() {
-            let state = self.read()?;
-            self.bar.set_message(format!("held at {}", format_positions(&state.position)));
-        }
-        Ok(())
-    }
 }

@@ -6,6 +6,7 @@
 //! likelihood, or from corners by minimizing the reprojection error, with a small unknown error of each robot pose. The
 //! result has an uncertainty and the errors of held-out samples. Input that does not determine the result is refused.
 
+mod arm_plan;
 mod closed_form;
 mod consensus;
 mod corner_fit;
@@ -19,6 +20,7 @@ mod mistakes;
 mod next_poses;
 mod planar_pose;
 mod pose_fit;
+mod reach;
 mod refine;
 mod refusal;
 mod report;
@@ -30,6 +32,7 @@ mod shutter;
 #[cfg(test)]
 mod tests;
 
+pub use arm_plan::{ArmPlan, ArmPlanOptions, ArmStep, FirstView, MIN_POSES};
 pub use closed_form::ClosedForm;
 pub(crate) use closed_form::nearest_rotation;
 pub use evaluation::{MAX_FOLDS, Scatter};
@@ -37,6 +40,7 @@ pub use excitation::RotationExcitation;
 pub use guidance::{HandEyeAdvice, HandEyeGuidance, RECOMMENDED_POSES};
 pub use next_poses::{NextPose, NextPoseOptions, suggest_next_poses};
 pub use pose_fit::HandEyeNoise;
+pub use reach::Reach;
 pub use refusal::Refusal;
 pub use report::{HandEyeCalibration, JointOffset, SampleReport, SampleStatus};
 pub use shutter::{FlangeMotion, corners_at_mid_exposure};

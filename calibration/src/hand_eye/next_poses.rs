@@ -6,6 +6,7 @@
 use super::excitation;
 use super::geometry;
 use super::pose_fit::Measurement;
+use super::reach::Reach;
 use super::report::{self, HandEyeCalibration};
 use super::{HandEyeInput, Setup};
 use kinematics::random::Random;
@@ -13,8 +14,8 @@ use kinematics::{Intrinsics, Transform};
 use nalgebra::{DMatrix, Matrix6, Point3, Translation3, UnitQuaternion, Vector3};
 
 /// Options of [`suggest_next_poses`].
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct NextPoseOptions {
+#[derive(Clone, Copy, Debug)]
+pub struct NextPoseOptions<'a> {
     /// Number of poses.
     pub n_poses: usize,
     /// Center of the board, meters in the board frame.
@@ -23,6 +24,10 @@ pub struct NextPoseOptions {
     pub radius_m: f64,
     /// Largest angle between the normal of the board and the viewing direction, radians.
     pub max_tilt_rad: f64,
+    /// The space in which the arm moves, and its joints now. `None` if a person moves it.
+    pub reach: Option<(Reach<'a>, &'a [f64])>,
+    /// Seed of the random candidates.
+    pub seed: u64,
 }
 
 /// A suggested pose.
@@ -40,13 +45,13 @@ pub struct NextPose {
 
 /// Suggests poses for a finished calibration. `input` must be that of the calibration.
 ///
-/// With a chain and joint values, candidates are configurations near those of the samples, within the joint limits.
-/// Without, they are flange poses that rotate the camera around the board or about its own axes; the caller must check
-/// that the arm reaches them.
+/// With a [`Reach`], candidates are poses around the board to which the arm moves within it. With a chain and joint values,
+/// they are configurations near those of the samples, within the joint limits. Without, they are flange poses that rotate
+/// the camera around the board or about its own axes; the caller must check that the arm reaches them.
 pub fn suggest_next_poses(
     input: &HandEyeInput<'_>,
     calibration: &HandEyeCalibration,
-    options: &NextPoseOptions,
+    options: &NextPoseOptions<'_>,
 ) -> Vec<NextPose> {
     let scene = Scene { input, calibration, options };
     let mut information = match calibration.refined.covariance.clone().try_inverse() {
@@ -99,7 +104,7 @@ struct Candidate {
 struct Scene<'a> {
     input: &'a HandEyeInput<'a>,
     calibration: &'a HandEyeCalibration,
-    options: &'a NextPoseOptions,
+    options: &'a NextPoseOptions<'a>,
 }
 
 impl Scene<'_> {
@@ -113,7 +118,7 @@ impl Scene<'_> {
             return Vec::new();
         };
         let unit_covariance = self.mean_unit_covariance();
-        let mut random = Random::new(1);
+        let mut random = Random::new(self.options.seed);
         (0..TRIALS)
             .filter_map(|_| {
                 let sample_ix = used[random.below(used.len())];
@@ -121,6 +126,11 @@ impl Scene<'_> {
                 let a = geometry::a_of(self.input.setup, &base_from_flange);
                 let camera_from_board = refined.solution.camera_from_board(&a);
                 self.is_well_visible(&camera_from_board, distance_m).then_some(())?;
+                // Inverse kinematics last, because it takes longest.
+                let joints = match &self.options.reach {
+                    Some((reach, current)) => Some(reach.joints_for(&base_from_flange, current)?),
+                    None => joints,
+                };
                 let measurement =
                     Measurement { stop_ix: usize::MAX, weight: 1.0, a, camera_from_board, unit_covariance };
                 let (jacobian, weight) =
@@ -145,7 +155,7 @@ impl Scene<'_> {
         const MAX_JOINT_CHANGE: f64 = 0.8;
         const MAX_ROTATION_RAD: f64 = 0.9;
         let sample = &self.input.samples[sample_ix];
-        if let (Some(chain), Some(joints)) = (self.input.chain, &sample.joints) {
+        if let (None, Some(chain), Some(joints)) = (&self.options.reach, self.input.chain, &sample.joints) {
             let moved: Vec<f64> =
                 joints.iter().map(|joint| joint + MAX_JOINT_CHANGE * random.uniform(-1.0, 1.0)).collect();
             let is_allowed =
@@ -164,12 +174,21 @@ impl Scene<'_> {
         };
         let center = (base_from_board * Point3::from(self.options.center_in_board)).coords;
         let about_center = Transform::from_parts(Translation3::from(center - turn * center), turn);
-        Some((about_center * sample.base_from_flange, None))
+        let turned = about_center * sample.base_from_flange;
+        if self.options.reach.is_none() {
+            return Some((turned, None));
+        }
+        // An arm also changes the distance and the place of the board in the image, which a person does anyway.
+        let distance_m =
+            (solution.camera_from_board(&geometry::a_of(self.input.setup, &turned))).translation.vector.norm();
+        let shift = Vector3::from_fn(|_, _| 0.1 * distance_m * random.uniform(-1.0, 1.0));
+        Some((Transform::from_parts((turned.translation.vector + shift).into(), turned.rotation), None))
     }
 
     fn is_well_visible(&self, camera_from_board: &Transform, distance_m: f64) -> bool {
         const DISTANCES: std::ops::RangeInclusive<f64> = 0.6..=1.6; // Relative to the samples so far.
         const MARGIN_FRAC: f64 = 0.02;
+        const ARM_MARGIN_FRAC: f64 = 0.05; // The arm moves before anyone can check whether the board is in view.
         const HALF_VIEW_RAD: f64 = 0.35; // Without intrinsics: the field of view of a narrow camera.
         let center = (camera_from_board * Point3::from(self.options.center_in_board)).coords;
         let normal = camera_from_board.rotation * Vector3::z();
@@ -188,11 +207,12 @@ impl Scene<'_> {
             let point = self.options.center_in_board + Vector3::new(cosine, sine, 0.0) * self.options.radius_m;
             (camera_from_board * Point3::from(point)).coords
         });
+        let margin_frac = if self.options.reach.is_some() { ARM_MARGIN_FRAC } else { MARGIN_FRAC };
         let is_inside = |intrinsics: &Intrinsics, point: &Vector3<f64>| {
             intrinsics.project(point).is_some_and(|pixel| {
                 (0..2).all(|axis| {
                     let size = f64::from(intrinsics.size_px[axis]);
-                    pixel[axis] > MARGIN_FRAC * size && pixel[axis] < (1.0 - MARGIN_FRAC) * size
+                    pixel[axis] > margin_frac * size && pixel[axis] < (1.0 - margin_frac) * size
                 })
             })
         };

@@ -273,6 +273,8 @@ fn next_poses_shrink_the_uncertainty() {
         center_in_board: Vector3::new(0.1, 0.0625, 0.0),
         radius_m: 0.12,
         max_tilt_rad: 0.9,
+        reach: None,
+        seed: 1,
     };
     let next = suggest_next_poses(&input, &before, &options);
     assert_eq!(next.len(), 4);
@@ -378,6 +380,8 @@ fn offsets_of_inner_joints_are_found_and_those_of_outer_joints_are_not_observabl
             center_in_board: Vector3::new(0.1, 0.0625, 0.0),
             radius_m: 0.12,
             max_tilt_rad: 0.9,
+            reach: None,
+            seed: 1,
         },
     );
     assert!(next.iter().all(|pose| pose.joints.is_some()) && next.len() == 2);

@@ -1,5 +1,6 @@
 //! Opens the devices of a rig file, or a recording, as one source of samples.
 
+mod movable;
 mod real;
 mod realsense;
 #[cfg(feature = "sim")]
@@ -8,6 +9,7 @@ mod simulated;
 mod simulated_tests;
 mod tags;
 
+pub use movable::{Movable, movable};
 #[cfg(target_os = "linux")]
 pub use real::franka_chain;
 pub use real::{check_motion, movable_arm, udp_arm_address};
@@ -78,18 +80,7 @@ impl Opened {
 /// needs.
 pub fn rig(mut rig: Rig, devices: Devices) -> crate::Result<Opened> {
     if devices == Devices::Sim {
-        rig.arm.driver = ArmDriver::Sim;
-        rig.base.driver = match rig.base.driver {
-            _ if base_moves(&rig.sim.scene) => BaseDriver::Sim,
-            BaseDriver::Tags => BaseDriver::Tags,
-            _ => BaseDriver::Fixed,
-        };
-        for scanner in &mut rig.scanners {
-            scanner.driver = ScannerDriver::Sim;
-        }
-        for camera in &mut rig.cameras {
-            camera.driver = CameraDriver::Sim;
-        }
+        use_simulated_devices(&mut rig);
     }
     without_readout_if_ideal(&mut rig);
     if let Some(device) = unsupported_device(&rig) {
@@ -106,6 +97,22 @@ pub fn rig(mut rig: Rig, devices: Devices) -> crate::Result<Opened> {
         _ => source,
     };
     Ok(Opened { rig, source, damage: Arc::default(), stamp_clock: StampClock::Computer })
+}
+
+/// Replaces every device by its simulated twin.
+fn use_simulated_devices(rig: &mut Rig) {
+    rig.arm.driver = ArmDriver::Sim;
+    rig.base.driver = match rig.base.driver {
+        _ if base_moves(&rig.sim.scene) => BaseDriver::Sim,
+        BaseDriver::Tags => BaseDriver::Tags,
+        _ => BaseDriver::Fixed,
+    };
+    for scanner in &mut rig.scanners {
+        scanner.driver = ScannerDriver::Sim;
+    }
+    for camera in &mut rig.cameras {
+        camera.driver = CameraDriver::Sim;
+    }
 }
 
 /// Opens a recording with the rig stored in it, or with the given one. The joint order is the one stored in the

@@ -10,9 +10,9 @@ use drivers::can::odrive::Endpoints;
 use drivers::can::{self, CanArm, MovableArmConfig, MovableCanArm};
 #[cfg(target_os = "linux")]
 use drivers::franka::{self, FrankaArm, MovableFrankaArm};
-use drivers::motion::MovableArm;
 #[cfg(target_os = "linux")]
-use drivers::motion::{MotionConfig, MotionLimits};
+use drivers::motion::MotionConfig;
+use drivers::motion::{MotionLimits, MovableArm};
 use drivers::udp::{UdpArm, UdpBase, UdpScanner};
 #[cfg(target_os = "linux")]
 use drivers::v4l2::{Config, Settings, V4l2Camera, V4l2Format};
@@ -88,9 +88,8 @@ pub fn check_motion(rig: &Rig) -> crate::Result<()> {
     }
 }
 
-/// Motion limits of each joint: positions from the URDF, speed from the rig file.
-#[cfg(target_os = "linux")]
-fn motion_config(rig: &Rig, motion: &ArmMotion) -> crate::Result<MotionConfig> {
+/// Motion limits of each joint, in the order of `arm.joints`: positions from the URDF, speed from the rig file.
+pub(super) fn motion_limits(rig: &Rig, acceleration_secs: f64, jerk_secs: f64) -> crate::Result<Vec<MotionLimits>> {
     let Rig { arm, .. } = rig;
     let chain = super::chain_of(rig)?;
     let mut limits = Vec::new();
@@ -98,12 +97,18 @@ fn motion_config(rig: &Rig, motion: &ArmMotion) -> crate::Result<MotionConfig> {
         let joint_ix = chain.joint_names().iter().position(|known| known == name);
         let joint =
             joint_ix.map(|joint_ix| chain.limits()[joint_ix]).context("a joint of the rig is not in its URDF")?;
-        let mut joint = MotionLimits::new(&joint, arm.max_speed_rad_s, motion.acceleration_secs, motion.jerk_secs);
+        let mut joint = MotionLimits::new(&joint, arm.max_speed_rad_s, acceleration_secs, jerk_secs);
         // URDF positions are device positions plus the offset.
         let offset = arm.joint_offsets.get(ix).copied().unwrap_or(0.0);
         joint.position = joint.position.map(|bound| bound - offset);
         limits.push(joint);
     }
+    Ok(limits)
+}
+
+#[cfg(target_os = "linux")]
+fn motion_config(rig: &Rig, motion: &ArmMotion) -> crate::Result<MotionConfig> {
+    let limits = motion_limits(rig, motion.acceleration_secs, motion.jerk_secs)?;
     let timeout = Duration::from_secs_f64(motion.timeout_millis / 1000.0);
     let ArmMotion { on_loss, accept_no_watchdog, .. } = *motion;
     Ok(MotionConfig { limits, on_loss, timeout, accept_no_watchdog })

@@ -1,6 +1,7 @@
 //! Opens the simulated twin of a rig: the same cameras and joints in MuJoCo.
 
 use crate::config::{BaseDriver, Camera, CameraDriver, Depth, Parent, Rig, Scanner, ScannerDriver, SimTarget};
+use drivers::motion::MotionLimits;
 use drivers::{Devices, Error, Live, Sample, Source};
 use keyframe::bail;
 use kinematics::{Intrinsics, Stamp, Transform};
@@ -33,6 +34,13 @@ pub(super) fn open(rig: &Rig, real: Devices) -> crate::Result<Box<dyn Source>> {
         n_left: rig.sim.n_images,
         end: rig.sim.duration_secs.map(|secs| start.plus_secs(secs)),
     }))
+}
+
+/// Opens a simulated rig with an arm that moves by commands.
+pub(super) fn commanded(rig: &Rig, limits: &[MotionLimits]) -> crate::Result<sim::CommandedRig> {
+    let mut config = config_of(rig)?;
+    (config.duration_secs, config.n_images, config.truth) = (None, None, false);
+    Ok(sim::open(&config)?.into_commanded(limits)?)
 }
 
 /// Live simulated devices with their ground truth.

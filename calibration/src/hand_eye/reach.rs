@@ -1,0 +1,90 @@
+//! Configurations near a start to which an arm may be sent.
+
+use kinematics::{Chain, Transform};
+
+/// Distance that configurations keep from the limits of the joints, radians or meters.
+const LIMIT_MARGIN: f64 = 0.05;
+/// Number of configurations on a path at which the distance from the start is checked.
+const PATH_STEPS: u32 = 8;
+
+/// The space around a start configuration in which an arm moves.
+#[derive(Clone, Copy, Debug)]
+pub struct Reach<'a> {
+    /// The arm.
+    pub chain: &'a Chain,
+    /// The joints at the start, in the order of the chain.
+    pub start: &'a [f64],
+    /// Largest change of a joint from the start, radians or meters.
+    pub max_joint_change: f64,
+    /// Largest distance of the flange from its position at the start, meters.
+    pub max_distance_m: f64,
+}
+
+impl Reach<'_> {
+    /// Joint values for a flange pose, if the arm reaches it on a straight path in joint space from `current` that stays
+    /// near the start.
+    pub fn joints_for(&self, base_from_flange: &Transform, current: &[f64]) -> Option<Vec<f64>> {
+        let start = self.chain.forward(self.start).ok()?;
+        let distance_m = |pose: &Transform| (pose.translation.vector - start.translation.vector).norm();
+        if distance_m(base_from_flange) > self.max_distance_m {
+            return None;
+        }
+        let bounds: Vec<[f64; 2]> = self
+            .chain
+            .limits()
+            .iter()
+            .zip(self.start)
+            .map(|(limit, start)| {
+                // A joint that starts close to its limit may stay there.
+                let lower = (limit.lower + LIMIT_MARGIN).min(*start);
+                let upper = (limit.upper - LIMIT_MARGIN).max(*start);
+                [lower.max(start - self.max_joint_change), upper.min(start + self.max_joint_change)]
+            })
+            .collect();
+        let joints = self.chain.inverse(base_from_flange, self.start, &bounds).ok()??;
+        let is_near = |step: u32| {
+            let share = f64::from(step) / f64::from(PATH_STEPS);
+            let between: Vec<f64> = current.iter().zip(&joints).map(|(from, to)| from + share * (to - from)).collect();
+            self.chain.forward(&between).is_ok_and(|pose| distance_m(&pose) <= self.max_distance_m)
+        };
+        (current.len() == joints.len() && (1..PATH_STEPS).all(is_near)).then_some(joints)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use nalgebra::Vector3;
+
+    const PANDA: &str = include_str!("../../../rigs/robots/panda.urdf");
+    const START: [f64; 7] = [0.0, -0.3, 0.0, -2.2, 0.0, 2.2, 0.8];
+
+    #[test]
+    fn configurations_stay_near_the_start() {
+        let chain = Chain::from_urdf(PANDA, "panda_link0", "panda_link8").unwrap();
+        let reach = Reach { chain: &chain, start: &START, max_joint_change: 0.6, max_distance_m: 0.15 };
+        let start = chain.forward(&START).unwrap();
+        let near = start * Transform::new(Vector3::new(0.05, 0.0, -0.05), Vector3::new(0.2, 0.0, 0.1));
+        let joints = reach.joints_for(&near, &START).expect("the pose is near");
+        assert!((chain.forward(&joints).unwrap().inverse() * near).translation.vector.norm() < 1e-6);
+        assert!(joints.iter().zip(&START).all(|(a, b)| (a - b).abs() <= 0.6), "{joints:?}");
+        let far = start * Transform::translation(0.2, 0.0, 0.0);
+        assert_eq!(reach.joints_for(&far, &START), None, "beyond the distance");
+        let turned = start * Transform::new(Vector3::zeros(), Vector3::z() * 0.9);
+        assert_eq!(reach.joints_for(&turned, &START), None, "a joint would turn by more than 0.6");
+        // The first and the last configuration are near, but the flange passes far from the start.
+        let mut current = START;
+        current[3] += 1.2;
+        assert_eq!(reach.joints_for(&near, &current), None, "the path is too far");
+    }
+
+    #[test]
+    fn joint_close_to_its_limit_may_stay_there() {
+        let chain = Chain::from_urdf(PANDA, "panda_link0", "panda_link8").unwrap();
+        let mut start = START;
+        start[5] = 3.74;
+        let reach = Reach { chain: &chain, start: &start, max_joint_change: 0.6, max_distance_m: 0.15 };
+        let pose = chain.forward(&start).unwrap();
+        assert_eq!(reach.joints_for(&pose, &start).as_deref(), Some(&start[..]));
+    }
+}

@@ -1,0 +1,77 @@
+//! Opens a camera together with an arm that can be moved, real or simulated.
+
+use super::real;
+use super::{Devices, check_arm, check_intrinsics, use_simulated_devices, without_readout_if_ideal};
+use crate::config::{ArmDriver, BaseDriver, Camera, CameraDriver, Rig};
+use drivers::motion::MovableArm;
+use keyframe::bail;
+
+/// A camera and an arm that can be moved.
+pub struct Movable {
+    /// The rig with all settings resolved. It contains only this camera.
+    pub rig: Rig,
+    /// The arm. Its positions do not include `arm.joint_offsets`.
+    pub arm: Box<dyn MovableArm>,
+    /// The camera. It may also deliver depth.
+    pub camera: Box<dyn drivers::Camera>,
+}
+
+/// Opens a camera of a rig and enables its arm, which holds its position. Simulated devices run as fast as they are read.
+///
+/// # Errors
+///
+/// If the rig has no such camera, a device cannot be opened, the arm cannot be moved as configured, or only one of arm and
+/// camera is simulated.
+pub fn movable(rig: &Rig, devices: Devices, camera: &str) -> crate::Result<Movable> {
+    let mut rig = rig.clone();
+    rig.cameras.retain(|other: &Camera| &*other.name == camera);
+    rig.scanners.clear();
+    let Some(driver) = rig.cameras.first().map(|camera| camera.driver) else {
+        bail!("the rig has no camera {camera:?}");
+    };
+    if devices == Devices::Sim {
+        use_simulated_devices(&mut rig);
+    } else if (rig.arm.driver == ArmDriver::Sim) != (driver == CameraDriver::Sim) {
+        bail!(
+            "the arm and camera {camera:?} must both be real or both be simulated, so that the images show the motion"
+        );
+    }
+    if rig.base.driver != BaseDriver::Fixed {
+        bail!("base.driver: the base must be fixed; use a copy of the rig file with base.driver = \"fixed\"");
+    }
+    without_readout_if_ideal(&mut rig);
+    check_arm(&rig)?;
+    if rig.arm.driver == ArmDriver::Sim {
+        check_intrinsics(&rig)?;
+        return simulated(rig);
+    }
+    // The camera first: the arm is enabled only if everything else works. It is opened for motion, not for reading.
+    let driver = std::mem::replace(&mut rig.arm.driver, ArmDriver::None);
+    let opened = real::open(&mut rig);
+    rig.arm.driver = driver;
+    let Some(camera) = opened?.cameras.into_iter().next() else {
+        bail!("camera {camera:?} was not opened");
+    };
+    let arm = real::movable_arm(&rig)?;
+    Ok(Movable { rig, arm, camera })
+}
+
+#[cfg(feature = "sim")]
+fn simulated(rig: Rig) -> crate::Result<Movable> {
+    /// The defaults of `[arm.motion]`, which a simulated arm does not need.
+    const DEFAULT_SECS: [f64; 2] = [0.5, 0.1];
+    let motion = rig.arm.motion.as_ref();
+    let [acceleration_secs, jerk_secs] =
+        motion.map_or(DEFAULT_SECS, |motion| [motion.acceleration_secs, motion.jerk_secs]);
+    let limits = real::motion_limits(&rig, acceleration_secs, jerk_secs)?;
+    let sim::CommandedRig { arm, cameras, .. } = super::simulated::commanded(&rig, &limits)?;
+    let Some(camera) = cameras.into_iter().next() else {
+        bail!("the simulated rig has no camera");
+    };
+    Ok(Movable { rig, arm, camera })
+}
+
+#[cfg(not(feature = "sim"))]
+fn simulated(_rig: Rig) -> crate::Result<Movable> {
+    bail!("this program was built without the simulator: build it with `cargo build --release --features sim`")
+}

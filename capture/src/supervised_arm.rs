@@ -1,0 +1,120 @@
+//! Supervision of an arm that moves: its faults, requests to stop, and joint offsets.
+
+use crate::config::Rig;
+use crate::error::Context;
+use crate::stop::Stop;
+use drivers::motion::{JointTarget, Motion};
+use drivers::{Error, MovableArm, clock};
+use keyframe::bail;
+use kinematics::JointState;
+use std::time::Duration;
+
+/// Duration of one wait for a joint state. It bounds the time until a request to stop is noticed.
+const POLL: Duration = Duration::from_millis(50);
+/// A movable arm that reports nothing for this long counts as lost.
+const MAX_SILENCE: Duration = Duration::from_secs(2);
+
+/// A movable arm and its joint offsets. All positions include `arm.joint_offsets`, as everywhere else.
+pub struct SupervisedArm {
+    arm: Box<dyn MovableArm>,
+    offsets: Vec<f64>,
+}
+
+/// How a motion ended.
+#[derive(Clone, Debug, PartialEq)]
+pub struct MotionEnd {
+    /// The joints at the end.
+    pub state: JointState,
+    /// Whether the arm reached its target. If not, a stop was requested.
+    pub has_arrived: bool,
+}
+
+impl SupervisedArm {
+    /// An arm that was opened for motion.
+    pub fn new(arm: Box<dyn MovableArm>, rig: &Rig) -> Self {
+        let mut offsets = rig.arm.joint_offsets.clone();
+        offsets.resize(rig.arm.joints.len(), 0.0);
+        Self { arm, offsets }
+    }
+
+    /// Enables a stopped arm again. Call this only at the request of a person who has checked the arm.
+    ///
+    /// # Errors
+    /// If the arm does not recover.
+    pub fn recover(&mut self) -> crate::Result<()> {
+        Ok(self.arm.recover()?)
+    }
+
+    /// Reads the next joint state.
+    ///
+    /// # Errors
+    /// If the arm has stopped because of a fault, or reports nothing.
+    pub fn read(&mut self) -> crate::Result<JointState> {
+        let deadline = clock::now().plus_secs(MAX_SILENCE.as_secs_f64());
+        loop {
+            let state = self.arm.read(POLL);
+            if let Motion::Stopped { reason } = self.arm.motion() {
+                bail!("the arm stopped: {reason}. Inspect it, then recover it with `fieldrig move --recover`");
+            }
+            match state {
+                Err(Error::NoJoints { .. }) if clock::now() < deadline => {}
+                state => {
+                    let mut state = state?;
+                    state.position.iter_mut().zip(&self.offsets).for_each(|(position, offset)| *position += offset);
+                    return Ok(state);
+                }
+            }
+        }
+    }
+
+    /// Sends a target; returns it as clamped to the limits.
+    ///
+    /// # Errors
+    /// If the arm rejects it.
+    pub fn command(&mut self, requested: &JointTarget) -> crate::Result<JointTarget> {
+        let with_offsets = |target: &JointTarget, sign: f64| JointTarget {
+            position: target
+                .position
+                .iter()
+                .zip(&self.offsets)
+                .map(|(position, offset)| position + sign * offset)
+                .collect(),
+        };
+        let accepted = self.arm.command(&with_offsets(requested, -1.0))?;
+        Ok(with_offsets(&accepted, 1.0))
+    }
+
+    /// Waits until the arm has arrived. If a stop is requested, brings it to rest instead.
+    ///
+    /// * `on_state`: is called with each joint state.
+    ///
+    /// # Errors
+    /// If the arm has stopped because of a fault, or cannot be stopped.
+    pub fn follow(&mut self, stop: &Stop, mut on_state: impl FnMut(&JointState)) -> crate::Result<MotionEnd> {
+        loop {
+            let state = self.read()?;
+            on_state(&state);
+            if self.arm.motion() == Motion::Holding {
+                return Ok(MotionEnd { state, has_arrived: true });
+            }
+            if stop.requested() {
+                self.arm.stop().context("cannot stop the arm")?;
+                while self.arm.motion() == Motion::Moving {
+                    on_state(&self.read()?);
+                }
+                return Ok(MotionEnd { state: self.read()?, has_arrived: false });
+            }
+        }
+    }
+
+    /// Reads the arm, which holds its position, until a stop is requested.
+    ///
+    /// # Errors
+    /// As [`SupervisedArm::read`].
+    pub fn hold(&mut self, stop: &Stop, mut on_state: impl FnMut(&JointState)) -> crate::Result<()> {
+        while !stop.requested() {
+            on_state(&self.read()?);
+        }
+        Ok(())
+    }
+}
