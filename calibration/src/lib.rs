@@ -37,6 +37,7 @@ mod params;
 mod registration;
 #[cfg(any(test, feature = "scenes"))]
 pub mod scenes;
+mod tag_check;
 pub mod time_offset;
 mod trial;
 
@@ -56,4 +57,5 @@ pub use registration::{
     Alignment, CameraMovement, Estimate, ExtrinsicsCovariance, MOVEMENT_WINDOW, MovementDetector, PoseEstimate,
     PoseSigmas, ScalarEstimate, StationCorrection, Unobservable, align, candidates, register_station,
 };
+pub use tag_check::{ContradictionCause, TagCheck, TagContradiction, TagObservation};
 pub use trial::{CameraRefinement, Candidate, MIN_VALIDATION_IMAGES, Trial, TrialReport};

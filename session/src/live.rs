@@ -6,7 +6,7 @@ use crate::render_budget::RenderBudget;
 use crate::session::Session;
 use crate::{scene_hint, time_slices};
 use calibration::CalibratedCamera;
-use capture::{Change, Feed, FeedItem, InputResult};
+use capture::{Change, Feed, FeedItem, InputResult, Notes};
 use keyframe::{Keyframe, Split};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -70,6 +70,7 @@ pub struct Live {
     published_cameras: Vec<CalibratedCamera>,
     scoring_time: Duration,
     notes: Vec<String>,
+    device_notes: Notes,
     recoveries: Recoveries,
     /// Times of the keyframes of the first session.
     ledger: Ledger,
@@ -98,6 +99,7 @@ impl Live {
             published_cameras: Vec::new(),
             scoring_time: Duration::ZERO,
             notes: options.notes,
+            device_notes: options.device_notes,
             recoveries: Recoveries::new(options.open_gpu),
             ledger: Ledger::default(),
             keyframe_change: None,
@@ -439,7 +441,8 @@ impl Live {
             rejected: self.feed.rejected(),
             model: models.next().unwrap_or_default(),
             others: models.collect(),
-            notes: self.notes.iter().cloned().chain(movements.iter().map(ToString::to_string)).collect(),
+            notes: [self.notes.clone(), self.device_notes.list(), movements.iter().map(ToString::to_string).collect()]
+                .concat(),
             result: None,
         });
         Ok(())
@@ -545,6 +548,8 @@ pub struct LiveOptions {
     pub start_keyframes: usize,
     /// Notes shown on the page.
     pub notes: Vec<String>,
+    /// Notes about the devices, which are added during the run and shown, too.
+    pub device_notes: Notes,
     /// Reopens the GPU after a failure.
     pub open_gpu: OpenGpu,
 }

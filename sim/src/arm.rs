@@ -27,7 +27,7 @@ pub(crate) struct JointReading {
 
 /// What the controller follows.
 enum Reference {
-    Scan(Follower),
+    Scan(Box<Follower>),
     Commands(JointCommands),
 }
 
@@ -87,7 +87,7 @@ impl Arm {
         }
         data.qpos_mut().copy_from_slice(follower.position_rad().as_slice());
         data.forward();
-        let reference = Reference::Scan(follower);
+        let reference = Reference::Scan(Box::new(follower));
         Ok(Self { data, reference, n_steps: 0, readings: VecDeque::new(), history_duration_nanos })
     }
 

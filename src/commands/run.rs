@@ -12,7 +12,7 @@ use capture::config::{ArmDriver, Override, Rig};
 use capture::doctor;
 use capture::open::{self, Devices, Opened};
 use capture::{
-    Counts, Feed, Input, InputResult, Join, Rejection, SampleUse, StampClock, StationReport, Stations, Stop,
+    Counts, Feed, Input, InputResult, Join, Notes, Rejection, SampleUse, StampClock, StationReport, Stations, Stop,
 };
 use drivers::Source;
 use keyframe::{Keyframe, Split, counted};
@@ -341,7 +341,8 @@ pub(super) fn start(
     }
     // Compile kernels before the first image, so that keyframes do not wait.
     models.iter_mut().try_for_each(|model| model.method.prepare())?;
-    let Opened { rig, source, damage, stamp_clock } = args.open(rig)?;
+    let device_notes = Notes::default();
+    let Opened { rig, source, damage, stamp_clock } = args.open(rig)?.with_tag_check(&device_notes)?;
     args.print_address(&server.url())?;
     let folders = created.make_each(args.out(), &kinds, Some(&rig))?;
     let held = previous.map_or(&[][..], |previous| &previous.keyframes);
@@ -410,7 +411,7 @@ pub(super) fn start(
         sessions.push(session);
     }
     let start_keyframes = rig.join.start_keyframes_or_default(pace == Pace::RealTime, depth);
-    let options = LiveOptions { pace, start_keyframes, notes, open_gpu };
+    let options = LiveOptions { pace, start_keyframes, notes, device_notes, open_gpu };
 
     let held = sessions.first().map_or(Vec::new(), |session| session.keyframes().to_vec());
     let live = Live::new(sessions, feed, hub, options).resume_from(held);

@@ -7,6 +7,7 @@ mod realsense;
 mod simulated;
 #[cfg(all(test, feature = "sim"))]
 mod simulated_tests;
+mod tag_check;
 mod tags;
 
 pub use movable::{Movable, movable};
@@ -16,6 +17,7 @@ pub use real::{check_motion, movable_arm, udp_arm_address};
 
 use crate::config::{ArmDriver, BaseDriver, CameraDriver, Override, Parent, Rig, ScannerDriver};
 use crate::error::{Context, Error};
+use crate::notes::Notes;
 use crate::stamp_clock::StampClock;
 use drivers::recording::{RIG_FILE, Recorder, Recording, RecordingMetadata, URDF_FILE};
 use drivers::{Live, Playback, Repeating, Sample, Source};
@@ -58,6 +60,19 @@ impl Opened {
     pub fn in_real_time(self) -> Self {
         let playback = Playback::new(self.source);
         Self { stamp_clock: StampClock::Playback(playback.clock()), source: Box::new(playback), ..self }
+    }
+
+    /// Compares the poses of cameras with the tags in the rig file, and warns once about each camera that contradicts them.
+    /// Without tags, or if the tags locate the base, nothing is compared.
+    ///
+    /// * `notes`: gets the warnings.
+    ///
+    /// # Errors
+    ///
+    /// If the thread for the detection cannot be started.
+    pub fn with_tag_check(self, notes: &Notes) -> crate::Result<Self> {
+        let source = tag_check::TagCheckSource::check(&self.rig, self.source, notes)?;
+        Ok(Self { source, ..self })
     }
 
     /// Repeats the recording at `path` without end.

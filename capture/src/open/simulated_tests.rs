@@ -3,6 +3,7 @@
 use super::{Devices, Opened};
 use crate::config::{Override, Rig};
 use crate::join::{Join, JoinEvent};
+use crate::notes::Notes;
 use crate::stations::Stations;
 use drivers::tags::{Family, TagDetector};
 use drivers::wire::datagram::{Clock, DatagramHeader, PoseDatagram, ScanPart, encode_pose, encode_scan};
@@ -53,6 +54,40 @@ fn keyframes(opened: Opened, mut on_sample: impl FnMut(&Sample)) -> (Vec<Arc<Key
 fn bits(keyframes: &[Arc<Keyframe>]) -> Vec<String> {
     // Debug prints the shortest digits that parse to the same float, so equal texts mean equal bits.
     keyframes.iter().map(|keyframe| format!("{keyframe:?}")).collect()
+}
+
+/// The notes of a run of the rig with tags on a fixed base, with a camera that has moved relative to its mount.
+fn tag_notes(moved: &Transform) -> Vec<String> {
+    let overrides = [
+        Override::new("sim.lockstep", true),
+        Override::new("base.driver", "fixed"),
+        Override::new("sim.duration_secs", 8.0),
+        Override::new("camera.wrist.rate_hz", 4.0),
+    ];
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../rigs/tags.toml");
+    let mut rig = Rig::load(&path, &overrides).expect("a bundled rig file");
+    let camera = &mut rig.cameras[0];
+    camera.depth = None;
+    camera.sim.truth.parent_from_camera = Some(camera.parent_from_camera * moved);
+    let notes = Notes::default();
+    let opened = super::rig(rig, Devices::Sim).expect("the rig opens").with_tag_check(&notes).expect("a thread");
+    let mut source = opened.source;
+    while source.next_sample().expect("the rig works").is_some() {}
+    notes.list()
+}
+
+#[test]
+fn tags_show_that_a_camera_has_moved() {
+    assert_eq!(tag_notes(&Transform::identity()), Vec::<String>::new());
+    let moved = Transform::new(nalgebra::Vector3::new(0.012, -0.009, 0.0), nalgebra::Vector3::new(0.0, 0.035, 0.0));
+    let notes = tag_notes(&moved);
+    let [note] = &notes[..] else { panic!("one note: {notes:?}") };
+    let numbers: Vec<f64> = note.split(' ').filter_map(|word| word.parse().ok()).collect();
+    let [degrees, degrees_sigma, mm, mm_sigma, ..] = numbers[..] else { panic!("{note}") };
+    assert!((degrees - 2.0).abs() < 0.3 && (mm - 15.0).abs() < 3.0, "{note}");
+    assert!(degrees_sigma < 0.4 && mm_sigma < 3.0, "{note}");
+    assert!(note.starts_with("camera \"wrist\" is off by ") && note.contains("according to tags"), "{note}");
+    assert!(note.contains("it has moved relative to its mount"), "{note}");
 }
 
 #[test]
