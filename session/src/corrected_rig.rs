@@ -339,4 +339,18 @@ mod tests {
         let base = message(with_extrinsics(&rig, "wrist", Parent::Base, &pose));
         assert!(base.contains("is flange") && base.contains("the base"), "{base}");
     }
+
+    #[test]
+    fn pose_in_the_base_is_converted_for_a_camera_in_the_world() {
+        let mut rig = bundled_rig();
+        rig.cameras[0].parent = Parent::World;
+        rig.base.world_from_base = Transform::new(Vector3::new(1.0, 2.0, 0.5), Vector3::z() * 0.5);
+        let base_from_camera = Transform::new(Vector3::new(0.4, -0.1, 0.3), Vector3::x() * 1.5);
+        let moved = with_extrinsics(&rig, "wrist", Parent::Base, &base_from_camera).unwrap();
+        let difference = moved.cameras[0].parent_from_camera.inverse() * rig.base.world_from_base * base_from_camera;
+        assert!(difference.translation.vector.norm() < 1e-12 && difference.rotation.angle() < 1e-7);
+        rig.base.driver = capture::config::BaseDriver::Udp;
+        let error = with_extrinsics(&rig, "wrist", Parent::Base, &base_from_camera).unwrap_err().to_string();
+        assert!(error.contains("is world"), "a moving base has no fixed pose in the world: {error}");
+    }
 }

@@ -38,6 +38,8 @@ pub struct Unused {
     pub name: String,
     /// Why it was not used.
     pub reason: String,
+    /// Whether its file could not be read, so that nothing is known about the target.
+    pub is_unreadable: bool,
 }
 
 /// Checks that a report can be written to this path.

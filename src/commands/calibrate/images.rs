@@ -6,7 +6,7 @@ use calibration::{BoardPoint, BoardView};
 use session::calibration_report::{Photo, Photos, Unused};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicUsize, Ordering};
-use targets::{Detection, GrayImage, TargetSpec};
+use targets::{Counts, Detection, GrayImage, TargetSpec};
 
 /// The target in one image.
 #[derive(Debug)]
@@ -33,6 +33,13 @@ pub(super) enum NoBoard {
     /// The image can be read but does not show the target.
     #[error(transparent)]
     NotDetected(#[from] targets::NotDetected),
+}
+
+impl NoBoard {
+    /// The image with this reason, for reports and messages.
+    pub(super) fn unused(&self, name: String) -> Unused {
+        Unused { name, reason: self.to_string(), is_unreadable: matches!(self, Self::Unreadable(_)) }
+    }
 }
 
 /// An image file and the name that messages use for it.
@@ -133,6 +140,54 @@ fn check_readable(images: &[DetectedImage]) -> Result<(), BadArgument> {
     Ok(())
 }
 
+/// A chessboard of another size than that of the target.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct OtherSize {
+    /// What the images show, and what to do.
+    pub(super) text: String,
+    /// Whether more images show the other size than the given one.
+    pub(super) prevails: bool,
+}
+
+/// The size of a board that several images show instead of that of the target.
+pub(super) fn other_size<'a>(
+    images: impl Iterator<Item = &'a DetectedImage>,
+    target: &TargetSpec,
+) -> Option<OtherSize> {
+    /// Fewer images may show a part of the board.
+    const MIN_IMAGES: usize = 3;
+    let (mut n_images, mut n_detected) = (0, 0);
+    let mut found_sizes: Vec<(Counts, usize)> = Vec::new();
+    for image in images {
+        n_images += 1;
+        match &image.board {
+            Ok(_) => n_detected += 1,
+            Err(NoBoard::NotDetected(targets::NotDetected::OtherSize { found, .. })) => {
+                match found_sizes.iter_mut().find(|(size, _)| size == found) {
+                    Some((_, n)) => *n += 1,
+                    None => found_sizes.push((*found, 1)),
+                }
+            }
+            Err(_) => (),
+        }
+    }
+    let (found, n) = found_sizes.into_iter().max_by_key(|(_, n)| *n).filter(|(_, n)| *n >= MIN_IMAGES)?;
+    let given = target.to_string();
+    let parts: Vec<&str> = given.split(':').collect();
+    let remedy = match parts[..] {
+        ["chessboard", _, square] => format!("use --target chessboard:{found}:{square}"),
+        _ => "check the counts of --target".to_owned(),
+    };
+    let prevails = n > n_detected;
+    let others = match n_detected {
+        0 => String::new(),
+        _ => format!(", {n_detected} images seem to show a board of the given size, which may be a part of it"),
+    };
+    let text =
+        format!("{n} of {n_images} images show a board with {found} inner corners, not {given}{others}; {remedy}");
+    Some(OtherSize { text, prevails })
+}
+
 fn detect_in_file(path: &Path, name: &str, target: &TargetSpec) -> Result<Board, NoBoard> {
     let unreadable = |error: image::ImageError| NoBoard::Unreadable(error.to_string());
     let reader = image::ImageReader::open(path).and_then(image::ImageReader::with_guessed_format);
@@ -159,9 +214,6 @@ pub(super) fn photos(files: &[ImageFile]) -> Photos {
 
 /// The images without the target, for a report.
 pub(super) fn unused(images: &[DetectedImage]) -> Vec<Unused> {
-    let reason = |image: &DetectedImage| {
-        let reason = image.board.as_ref().err()?.to_string();
-        Some(Unused { name: image.name.clone(), reason })
-    };
+    let reason = |image: &DetectedImage| Some(image.board.as_ref().err()?.unused(image.name.clone()));
     images.iter().filter_map(reason).collect()
 }

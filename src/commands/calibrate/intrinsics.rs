@@ -80,6 +80,8 @@ struct Printed<'a> {
 struct PrintedRejection {
     image: String,
     reason: String,
+    #[serde(skip)]
+    is_unreadable: bool,
 }
 
 #[derive(Debug, Serialize)]
@@ -116,6 +118,7 @@ struct Detected {
     photos: Photos,
     /// Why there are no images.
     no_images: Option<String>,
+    other_size: Option<OtherSize>,
     warnings: Vec<String>,
 }
 
@@ -146,7 +149,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     } else {
         describe(&printed)?
     }
-    if let Some(warning) = uncertainty_warning(&calibration) {
+    for warning in warnings(&calibration) {
         log::warn!("{warning}");
     }
     if let Some(rig) = &mut rig {
@@ -171,23 +174,33 @@ impl Args {
                 }
             };
         let unused = images::unused(&images);
+        let other_size = images::other_size(images.iter(), &self.target);
         let (mut views, mut sizes_px) = (Vec::new(), Vec::new());
         for board in images.into_iter().filter_map(|image| image.board.ok()) {
             views.push(board.view);
             sizes_px.push(board.size_px);
         }
-        Ok(Detected { views, sizes_px, unused, photos, no_images, warnings })
+        let mut warnings = warnings;
+        if let Some(size) = other_size.as_ref().filter(|size| !size.prevails) {
+            log::warn!("{}", size.text);
+            warnings.push(size.text.clone());
+        }
+        Ok(Detected { views, sizes_px, unused, photos, no_images, other_size, warnings })
     }
 
     fn calibrate(&self, detected: &Detected) -> anyhow::Result<IntrinsicsCalibration> {
-        let Detected { views, sizes_px, unused, no_images, .. } = detected;
+        let Detected { views, sizes_px, unused, no_images, other_size, .. } = detected;
         if let Some(reason) = no_images {
             return Err(InsufficientData(reason.clone()).into());
         }
+        if let Some(size) = other_size.as_ref().filter(|size| size.prevails) {
+            return Err(InsufficientData(format!("{}: {}", self.input.display(), size.text)).into());
+        }
         if views.is_empty() {
-            // All images usually fail for the same reason.
-            let reason = unused.first().map_or(String::new(), |first| format!("; {}: {}", first.name, first.reason));
-            let (input, target, n) = (self.input.display(), &self.target, unused.len());
+            // All images usually fail for the same reason. Those that cannot be read were reported before.
+            let read: Vec<&Unused> = unused.iter().filter(|unused| !unused.is_unreadable).collect();
+            let reason = read.first().map_or(String::new(), |first| format!("; {}: {}", first.name, first.reason));
+            let (input, target, n) = (self.input.display(), &self.target, read.len());
             let text = format!("{input}: {target} was not detected in any of {n} images{reason}");
             return Err(InsufficientData(text).into());
         }
@@ -201,7 +214,7 @@ impl Args {
         result: &anyhow::Result<IntrinsicsCalibration>,
     ) -> anyhow::Result<()> {
         let calibration = result.as_ref().ok();
-        let warnings = detected.warnings.iter().cloned().chain(calibration.and_then(uncertainty_warning)).collect();
+        let warnings = detected.warnings.iter().cloned().chain(calibration.into_iter().flat_map(warnings)).collect();
         let Some(heading) = outputs::heading(&self.input, result, warnings) else { return Ok(()) };
         let rig_line =
             calibration.map(|calibration| format!("intrinsics = {}", LensFile::of(&calibration.intrinsics).to_toml()));
@@ -218,6 +231,24 @@ impl Args {
         };
         outputs::write_report(path, &report.html())
     }
+}
+
+/// Problems of a result, one sentence each.
+fn warnings(calibration: &IntrinsicsCalibration) -> Vec<String> {
+    [uncertainty_warning(calibration), aspect_warning(calibration.intrinsics.focal_px)].into_iter().flatten().collect()
+}
+
+/// A warning if pixels are not square.
+fn aspect_warning([fx, fy]: [f64; 2]) -> Option<String> {
+    const MAX_RATIO: f64 = 1.05;
+    let ratio = fy / fx;
+    // False for NaN.
+    let is_square = (1.0 / MAX_RATIO..=MAX_RATIO).contains(&ratio);
+    (!is_square).then(|| {
+        format!(
+            "the focal lengths differ by a factor of {ratio:.2} (fy / fx), but pixels of almost all cameras are square: check that the images were not stretched or scaled in one direction, that interlaced lines were not dropped, and that --target has the right squares (width and height)"
+        )
+    })
 }
 
 /// A warning if the result is not accurate.
@@ -248,12 +279,16 @@ impl From<ModelArg> for LensModel {
 }
 
 fn printed<'a>(calibration: &'a IntrinsicsCalibration, unused: &[Unused]) -> Printed<'a> {
-    let unused =
-        unused.iter().map(|unused| PrintedRejection { image: unused.name.clone(), reason: unused.reason.clone() });
-    let rejected = calibration
-        .rejected
-        .iter()
-        .map(|rejected| PrintedRejection { image: rejected.image.clone(), reason: rejected.reason.to_string() });
+    let unused = unused.iter().map(|unused| PrintedRejection {
+        image: unused.name.clone(),
+        reason: unused.reason.clone(),
+        is_unreadable: unused.is_unreadable,
+    });
+    let rejected = calibration.rejected.iter().map(|rejected| PrintedRejection {
+        image: rejected.image.clone(),
+        reason: rejected.reason.to_string(),
+        is_unreadable: false,
+    });
     let rejected = unused.chain(rejected).collect();
     const N_PINHOLE_PARAMS: usize = 4;
     let names = calibration.params.iter().map(|param| param.name);
@@ -308,7 +343,8 @@ fn describe(printed: &Printed<'_>) -> anyhow::Result<()> {
     }
     let worst = largest(&printed.projection_sigma_px.values);
     print::line(format!("projection       +- {worst:.2} px (largest standard deviation in the image)"))?;
-    for rejection in rejected {
+    // Images that cannot be read were reported in a warning.
+    for rejection in rejected.iter().filter(|rejection| !rejection.is_unreadable) {
         print::line(format!("not used: {}: {}", rejection.image, rejection.reason))?;
     }
     if let Some(next) = printed.next_view {
@@ -316,4 +352,18 @@ fn describe(printed: &Printed<'_>) -> anyhow::Result<()> {
     }
     print::line(format!("rig file:\nintrinsics = {}", lens.to_toml()))?;
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn stretched_images_are_named() {
+        assert_eq!(aspect_warning([600.0, 601.0]), None);
+        for [fx, fy] in [[600.0, 1200.0], [600.0, 300.0], [600.0, f64::NAN]] {
+            let warning = aspect_warning([fx, fy]).expect("pixels are not square");
+            assert!(warning.contains(&format!("{:.2}", fy / fx)), "{warning}");
+        }
+    }
 }

@@ -198,6 +198,11 @@ impl Scan {
         &self.camera.intrinsics
     }
 
+    /// The size of a board that the images show instead of that of the target.
+    pub(super) fn other_size(&self, target: &TargetSpec) -> Option<OtherSize> {
+        images::other_size(self.images.iter().map(|(image, _)| image), target)
+    }
+
     pub(super) fn n_images(&self) -> usize {
         self.images.len()
     }
@@ -252,8 +257,11 @@ impl Scan {
                         joints: Some(arm.joints.clone()),
                     });
                 }
-                (Err(reason), _) => unused.push(Unused { name, reason: reason.to_string() }),
-                (_, None) => unused.push(Unused { name, reason: "the robot has no arm".to_owned() }),
+                (Err(reason), _) => unused.push(reason.unused(name)),
+                (_, None) => {
+                    let reason = "the robot has no arm".to_owned();
+                    unused.push(Unused { name, reason, is_unreadable: false });
+                }
             }
         }
         (samples, unused)

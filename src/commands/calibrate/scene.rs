@@ -118,10 +118,18 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     // Devices may report calibration that the rig file does not contain.
     let rig = if args.sim || data.rig.is_none() || !is_rig_file(&args.input) { given } else { data.rig.clone() };
     let result = calibrate_scene(&data, &args.params, rig.as_ref()).map_err(anyhow::Error::from);
-    if let Some(path) = report {
-        args.write_report(path, &data, rig.as_ref(), &result)?;
-    }
-    let calibration = result?;
+    // The result is printed even if the report cannot be written.
+    let written = match report {
+        Some(path) => args.write_report(path, &data, rig.as_ref(), &result),
+        None => Ok(()),
+    };
+    let calibration = match result {
+        Ok(calibration) => calibration,
+        Err(error) => {
+            outputs::log_failure(written);
+            return Err(error);
+        }
+    };
     let exit = exit::from_losses(&data.data_losses);
     let printed = printed(&data, &calibration, refusal(&data, &calibration));
     let is_refused = printed.refused.is_some();
@@ -131,6 +139,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         describe(&printed, &calibration, args.params == [Refine::Auto])?;
     }
     if is_refused {
+        outputs::log_failure(written);
         return if args.json {
             Ok(Exit::InsufficientData)
         } else {
@@ -145,6 +154,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
             log::info!("rig file written to {}", file.display());
         }
     }
+    written?;
     Ok(exit)
 }
 

@@ -6,6 +6,7 @@ mod source;
 
 use super::outputs::{self, ReportFlag, RigFlags, RigOutput};
 use super::scan::ScanOptions;
+use super::target::symmetry_warning;
 use super::target_argument;
 use crate::exit::{self, BadArgument, Exit, InsufficientData};
 use crate::print;
@@ -18,7 +19,7 @@ use kinematics::{Chain, Intrinsics, Transform};
 use nalgebra::Vector3;
 use printed::{Printed, PrintedPose, PrintedSample};
 use samples_file::{Samples, SamplesFile};
-use session::calibration_report::HandEyeReport;
+use session::calibration_report::{HandEyeReport, Unused};
 use source::Source;
 use std::path::{Path, PathBuf};
 use targets::TargetSpec;
@@ -111,6 +112,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         }
     };
     printed.samples.extend(samples.unused.iter().map(PrintedSample::unused));
+    printed.warnings.extend(samples.other_size.iter().filter(|size| !size.prevails).map(|size| size.text.clone()));
     if args.json {
         print::json(&printed)?
     } else {
@@ -142,14 +144,27 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
 
 /// A refusal with the reason why images were not used.
 fn with_reason(error: anyhow::Error, source: &Source, samples: &Samples) -> anyhow::Error {
-    match samples.unused.first() {
+    // Images that cannot be read were reported before.
+    let unused: Vec<&Unused> = samples.unused.iter().filter(|unused| !unused.is_unreadable).collect();
+    match unused.first() {
         Some(first) if exit::of(&error) == Exit::InsufficientData => {
-            let (n, n_all) = (samples.unused.len(), source.n_samples());
+            let n_all = source.n_samples() - (samples.unused.len() - unused.len());
+            let n = unused.len();
             let (name, reason) = (&first.name, &first.reason);
             let text = format!("{error:#}; {n} of {n_all} images do not show the target: {name}: {reason}");
             InsufficientData(text).into()
         }
         _ => error,
+    }
+}
+
+/// A refusal with a warning about the target.
+fn with_symmetry(error: calibration::Error, symmetry: Option<&str>) -> anyhow::Error {
+    match symmetry {
+        Some(symmetry) if matches!(error, calibration::Error::Refused(_)) => {
+            InsufficientData(format!("{error}; {symmetry}")).into()
+        }
+        _ => error.into(),
     }
 }
 
@@ -217,7 +232,8 @@ impl Args {
                 ..HandEyeOptions::default()
             },
         };
-        let mut calibration = calibrate_hand_eye(&input)?;
+        let symmetry = source.target().and_then(symmetry_warning);
+        let mut calibration = calibrate_hand_eye(&input).map_err(|error| with_symmetry(error, symmetry.as_deref()))?;
         if let Source::Scan { scan, .. } = source
             && scan.is_rolling_shutter()
         {
@@ -225,6 +241,7 @@ impl Args {
             input.samples = scan.samples(Some(&calibration.parent_from_camera)).0;
             calibration = calibrate_hand_eye(&input)?;
         }
+        calibration.warnings.extend(symmetry);
         let next_poses = match source.target() {
             Some(target) => suggest_next_poses(&input, &calibration, &next_pose_options(target)),
             None => Vec::new(),

@@ -66,6 +66,8 @@ pub(super) struct PrintedSample {
     /// Why the target was not found in its image.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(super) reason: Option<String>,
+    #[serde(skip)]
+    pub(super) is_unreadable: bool,
     pub(super) position_mm: Option<f64>,
     pub(super) rotation_deg: Option<f64>,
     pub(super) rms_px: Option<f64>,
@@ -112,6 +114,7 @@ pub(super) fn printed(calibration: &HandEyeCalibration) -> Printed {
             .map(|sample| PrintedSample {
                 name: sample.name.clone(),
                 reason: None,
+                is_unreadable: false,
                 status: match sample.status {
                     SampleStatus::Used => "used",
                     SampleStatus::Outlier => "outlier",
@@ -132,7 +135,13 @@ pub(super) fn printed(calibration: &HandEyeCalibration) -> Printed {
 impl PrintedSample {
     /// A sample whose image has no target.
     pub(super) fn unused(unused: &Unused) -> Self {
-        Self { name: unused.name.clone(), status: "no-board", reason: Some(unused.reason.clone()), ..Self::default() }
+        Self {
+            name: unused.name.clone(),
+            status: if unused.is_unreadable { "unreadable" } else { "no-board" },
+            reason: Some(unused.reason.clone()),
+            is_unreadable: unused.is_unreadable,
+            ..Self::default()
+        }
     }
 }
 
@@ -203,7 +212,9 @@ pub(super) fn describe(printed: &Printed, rig_pose: Option<&Transform>) -> anyho
             _ => format!("offset of {}: cannot be observed", joint.joint),
         })?;
     }
-    for sample in printed.samples.iter().filter(|sample| sample.status != "used") {
+    // Images that cannot be read were reported in a warning.
+    let is_news = |sample: &&PrintedSample| sample.status != "used" && !sample.is_unreadable;
+    for sample in printed.samples.iter().filter(is_news) {
         let reason = sample.reason.as_deref().unwrap_or(sample.status);
         print::line(format!("not used: {}: {reason}", sample.name))?;
     }

@@ -1,6 +1,6 @@
 //! The samples file of `fieldrig calibrate hand-eye`, and the target in its images.
 
-use super::super::images::{self, DetectedImage, ImageFile};
+use super::super::images::{self, DetectedImage, ImageFile, OtherSize};
 use super::super::json_object::JsonObject;
 use super::super::lens::LensFile;
 use super::super::{outputs, target_argument};
@@ -41,6 +41,7 @@ pub(super) struct Samples {
     pub(super) used: Vec<HandEyeSample>,
     /// Samples whose image cannot be read or does not show the target.
     pub(super) unused: Vec<Unused>,
+    pub(super) other_size: Option<OtherSize>,
     /// Size of the images, if there are any.
     pub(super) size_px: Option<[u32; 2]>,
     pub(super) photos: Photos,
@@ -119,8 +120,12 @@ impl SamplesFile {
             Some(target) if !files.is_empty() => images::detect(&files, target, is_hidden)?,
             _ => Vec::new(),
         };
-        let mut samples =
-            Samples { unused: images::unused(&detected), photos: images::photos(&files), ..Samples::default() };
+        let mut samples = Samples {
+            unused: images::unused(&detected),
+            other_size: self.target.as_ref().and_then(|target| images::other_size(detected.iter(), target)),
+            photos: images::photos(&files),
+            ..Samples::default()
+        };
         let mut detected = detected.into_iter();
         for (ix, entry) in self.entries.iter().enumerate() {
             let (name, board) = match &entry.board {
@@ -180,7 +185,8 @@ impl Entry {
                 if !path.is_file() {
                     return Err(sample.invalid("image", format!("{} does not exist", path.display())));
                 }
-                EntryBoard::Image(ImageFile { name: image.to_owned(), path })
+                // The name in messages is the path from here, not from the samples file.
+                EntryBoard::Image(ImageFile { name: path.display().to_string(), path })
             }
             (None, None) => return Err(sample.invalid("image", "missing; give \"image\" or \"camera_from_board\"")),
             (Some(_), Some(_)) => {

@@ -2,6 +2,7 @@
 
 use super::super::scan::Scan;
 use super::samples_file::{Samples, SamplesFile};
+use crate::exit::InsufficientData;
 use calibration::hand_eye::Setup;
 use kinematics::{Chain, Intrinsics, Transform};
 use targets::TargetSpec;
@@ -70,16 +71,20 @@ impl Source {
     pub(super) fn samples(&mut self, is_hidden: bool) -> anyhow::Result<Samples> {
         match self {
             Self::File(file) => file.detect(is_hidden),
-            Self::Scan { scan, .. } => {
+            Self::Scan { scan, target } => {
                 let (used, unused) = scan.samples(None);
                 let size_px = Some(scan.intrinsics().size_px);
-                Ok(Samples { used, unused, size_px, photos: scan.take_photos() })
+                let other_size = scan.other_size(target);
+                Ok(Samples { used, unused, other_size, size_px, photos: scan.take_photos() })
             }
         }
     }
 
     /// An error if there is no image, or if no image shows the target.
     pub(super) fn check(&self, samples: &Samples) -> anyhow::Result<()> {
+        if let Some(size) = samples.other_size.as_ref().filter(|size| size.prevails) {
+            return Err(InsufficientData(size.text.clone()).into());
+        }
         match self {
             Self::File(file) => Ok(file.check_detected(samples)?),
             Self::Scan { scan, .. } => Ok(scan.check()?),
