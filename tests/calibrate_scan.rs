@@ -11,6 +11,10 @@ use std::path::Path;
 
 const TARGET: &str = "charuco:5x7:24mm:18mm:5X5_100";
 
+/// Limit of the rotation error, degrees; also with a lens from the same few images, whose principal point is less certain.
+const MAX_DEG: f64 = 0.03;
+const MAX_DEG_WITH_LENS: f64 = 0.06;
+
 fn numbers(value: &Value) -> Vec<f64> {
     let inner = |values: &Vec<Value>| values.iter().flat_map(numbers).collect();
     value.as_array().map_or_else(|| value.as_f64().into_iter().collect(), inner)
@@ -67,7 +71,11 @@ fn lens_and_hand_eye_of_a_moving_arm_are_found_from_a_printed_target() {
         let output = fieldrig(folder, &args);
         assert!(output.status.success(), "{input:?}: {}", stderr(&output));
         assert!(is_report_with_photo(folder, "hand-eye.html"), "{input:?}");
-        check_pose(&json_of(&output));
+        check_pose(&json_of(&output), MAX_DEG);
+        // Devices, but not recordings, are accompanied by guidance.
+        let log = stderr(&output);
+        let is_guided = log.contains("0 poses with the target") && log.contains("more poses, rotated by 20 degrees");
+        assert_eq!(is_guided, input.contains(&"--sim"), "{log}");
     }
     let text = std::fs::read_to_string(folder.join("result.toml")).expect("a rig file");
     let rig: toml::Table = text.parse().expect("TOML");
@@ -83,13 +91,13 @@ fn is_report_with_photo(folder: &Path, file: &str) -> bool {
     std::fs::read_to_string(folder.join(file)).expect("a report").contains("data:image/jpeg")
 }
 
-fn check_pose(result: &Value) {
+fn check_pose(result: &Value, max_deg: f64) {
     const MAX_SIGMAS: f64 = 4.0;
     let found = numbers(&result["flange_from_camera"]).try_into().expect("16 numbers");
     let error = true_pose().inverse() * transform::from_rows(&found).expect("a rigid transform");
     let errors_mm = error.translation.vector * 1e3;
     let errors_deg = error.rotation.scaled_axis().map(f64::to_degrees);
-    assert!(errors_mm.norm() < 0.2 && errors_deg.norm() < 0.03, "{errors_mm} mm, {errors_deg} degrees");
+    assert!(errors_mm.norm() < 0.2 && errors_deg.norm() < max_deg, "{errors_mm} mm, {errors_deg} degrees");
     for (errors, key) in [(errors_mm, "sigma_mm"), (errors_deg, "sigma_deg")] {
         for (axis, sigma) in numbers(&result[key]).into_iter().enumerate() {
             let error = errors[axis].abs();
@@ -98,12 +106,108 @@ fn check_pose(result: &Value) {
     }
 }
 
+/// The lens in the rig file is wrong by 2 %, the pose of the camera by 3 degrees and 20 mm.
+#[test]
+fn arm_moves_around_a_target_until_its_camera_is_calibrated() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    write_rig(folder, "rig.toml", |_| ());
+    let moves = ["calibrate", "hand-eye", "rig.toml", "--sim", "--move", "--target", TARGET, "--with-intrinsics"];
+    let files = ["--report", "moved.html", "--write-rig", "moved.toml", "--json"];
+    let output = fieldrig(folder, &[&moves[..], &files].concat());
+    let log = stderr(&output);
+    assert!(output.status.success(), "{log}");
+    let result = json_of(&output);
+    check_pose(&result, MAX_DEG_WITH_LENS);
+    let n_samples = result["samples"].as_array().map_or(0, Vec::len);
+    assert!((10..=20).contains(&n_samples), "{n_samples} poses: {log}");
+    assert!(log.contains("finished: the standard deviations are at most"), "{log}");
+    assert!(log.contains("returning to the start"), "{log}");
+    assert!(is_report_with_photo(folder, "moved.html"));
+    let text = std::fs::read_to_string(folder.join("moved.toml")).expect("a rig file");
+    assert!(text.contains("[camera.wrist.sim") && !text.contains("lockstep = true"), "{text}");
+}
+
+#[test]
+fn joint_offsets_are_estimated_and_written() {
+    const OFFSETS: [f64; 7] = [0.0, 0.01, -0.008, 0.006, -0.01, 0.007, 0.0];
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    write_rig(folder, "rig.toml", |rig| {
+        let truth = toml::Table::from_iter([("true_joint_offsets".to_owned(), OFFSETS.to_vec().into())]);
+        rig["arm"].as_table_mut().expect("a table").insert("sim".into(), truth.into());
+    });
+    let args = ["calibrate", "hand-eye", "rig.toml", "--sim", "--move", "--with-intrinsics", "--with-joints"];
+    let goals = ["--max-poses", "24", "--target", TARGET, "--json", "--write-rig", "new.toml"];
+    let output = fieldrig(folder, &[&args[..], &goals].concat());
+    assert!(output.status.success(), "{}", stderr(&output));
+    let result = json_of(&output);
+    // Not only until the camera is accurate.
+    assert!(result["samples"].as_array().map_or(0, Vec::len) > 20, "{}", stderr(&output));
+    let text = std::fs::read_to_string(folder.join("new.toml")).expect("a rig file");
+    let rig: toml::Table = text.parse().expect("TOML");
+    for ix in 1..6 {
+        let sigma = result["joint_offsets"][ix]["sigma"].as_f64().expect("an inner joint");
+        let written = rig["arm"]["joint_offsets"][ix].as_float().expect("a number");
+        let error = (written - OFFSETS[ix]).abs();
+        assert!(error < 4.0 * sigma && error < 2e-3, "joint {ix}: {written}, true {}, sigma {sigma}", OFFSETS[ix]);
+    }
+    assert!(result["joint_offsets"][0]["offset"].is_null(), "the first offset is equivalent to a turn of the board");
+    assert_eq!(rig["arm"]["joint_offsets"][0].as_float(), Some(0.0));
+}
+
+/// Ctrl-C stops the arm; the images so far are used.
+#[cfg(unix)]
+#[test]
+fn interrupted_arm_is_calibrated_with_the_images_so_far() {
+    use std::io::{BufRead, BufReader, Read};
+    let folder = tempfile::tempdir().expect("a folder");
+    write_rig(folder.path(), "rig.toml", |_| ());
+    let args = ["calibrate", "hand-eye", "rig.toml", "--sim", "--move", "--target", TARGET, "--with-intrinsics"];
+    let mut child = std::process::Command::new(env!("CARGO_BIN_EXE_fieldrig"))
+        .current_dir(folder.path())
+        .args(args)
+        .args(["--goal-mm", "0.001", "--max-poses", "200", "--json"])
+        .stdout(std::process::Stdio::piped())
+        .stderr(std::process::Stdio::piped())
+        .spawn()
+        .expect("it is built");
+    let mut log = BufReader::new(child.stderr.take().expect("piped"));
+    let mut text = String::new();
+    while !text.contains("moving to pose 12") {
+        assert!(log.read_line(&mut text).expect("text") > 0, "it ended early: {text}");
+    }
+    let interrupt = std::process::Command::new("kill").args(["-INT", &child.id().to_string()]).status();
+    assert!(interrupt.expect("kill runs").success());
+    log.read_to_string(&mut text).expect("text");
+    let output = child.wait_with_output().expect("it ends");
+    assert!(output.status.success(), "{text}");
+    assert!(text.contains("stopping the arm") && !text.contains("returning to the start"), "{text}");
+    check_pose(&json_of(&output), MAX_DEG_WITH_LENS);
+}
+
 #[test]
 fn unusable_scans_are_rejected_with_the_reason() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
     write_rig(folder, "bad.toml", |rig| rig["sim"]["target"]["board"]["spec"] = "charuco:5x7:24:18mm:5X5_100".into());
     write_rig(folder, "rig.toml", |_| ());
+    write_rig(folder, "away.toml", |rig| {
+        let board = rig["sim"]["target"]["board"].as_table_mut().expect("a table");
+        board["world_from_board"]["xyz_m"] = vec![0.709729, 5.0, 0.315054].into();
+    });
+    let real_arm = |rig: &mut toml::Table| {
+        let arm = rig["arm"].as_table_mut().expect("a table");
+        arm["driver"] = "franka".into();
+        arm.insert("address".into(), "127.0.0.1:1".into());
+    };
+    let movable = |rig: &mut toml::Table| {
+        real_arm(rig);
+        let motion = toml::Table::from_iter([("on_loss".to_owned(), "hold".into())]);
+        rig["arm"].as_table_mut().expect("a table").insert("motion".into(), motion.into());
+    };
+    write_rig(folder, "real.toml", real_arm);
+    write_rig(folder, "movable.toml", movable);
     for (args, expected) in [
         (&["bad.toml", "--sim", "--target", TARGET][..], "sim.target.board"),
         (&["rig.toml", "--sim"], "--target is required"),
@@ -115,10 +219,19 @@ fn unusable_scans_are_rejected_with_the_reason() {
         (&["rig.toml", "--sim", "--target", TARGET, "--write-rig", "absent/rig.toml"], "in an existing folder"),
         (&["samples.json", "--write-rig", "new.toml"], "name the one to change with --rig"),
         (&["samples.json", "--rig", "rig.toml"], "add --write-rig"),
+        (&["rig.toml", "--sim", "--move"], "--target is required with --move"),
+        (&["samples.json", "--move", "--target", TARGET], "--move needs a rig file"),
+        (&["real.toml", "--move", "--enable-motion", "--target", TARGET], "no table [arm.motion]"),
+        (&["movable.toml", "--move", "--target", TARGET], "add --enable-motion to confirm"),
+        (&["movable.toml", "--move", "--enable-motion", "--target", TARGET], "must both be real or both be simulated"),
+        (&["rig.toml", "--sim", "--move", "--seconds", "9", "--target", TARGET], "use --max-poses"),
+        (&["rig.toml", "--sim", "--goal-mm", "1", "--target", TARGET], "--move"),
+        (&["away.toml", "--sim", "--move", "--target", TARGET], "the target is not visible at the start"),
     ] {
         let output = fieldrig(folder, &[&["calibrate", "hand-eye"], args].concat());
         let printed = stderr(&output);
-        assert!(matches!(output.status.code(), Some(1 | 2)) && printed.contains(expected), "{args:?}: {printed}");
+        let code = output.status.code();
+        assert!(matches!(code, Some(1 | 2 | 4)) && printed.contains(expected), "{args:?}: {code:?} {printed}");
     }
 }
 

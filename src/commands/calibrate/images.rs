@@ -3,6 +3,7 @@
 use crate::exit::BadArgument;
 use crate::print;
 use calibration::{BoardPoint, BoardView};
+use capture::CalibrationImage;
 use session::calibration_report::{Photo, Photos, Unused};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -194,6 +195,14 @@ fn detect_in_file(path: &Path, name: &str, target: &TargetSpec) -> Result<Board,
     let gray = reader.map_err(|error| unreadable(error.into()))?.decode().map_err(unreadable)?.into_luma8();
     let size_px = [gray.width(), gray.height()];
     detect_in_gray(GrayImage { size_px, pixels: gray.as_raw() }, name, target)
+}
+
+/// Detects a target in an image of a device or recording.
+pub(super) fn detect_in_image(image: &CalibrationImage, target: &TargetSpec) -> DetectedImage {
+    let name = format!("image at {:.3} s", image.secs);
+    let gray = GrayImage { size_px: image.size_px, pixels: &image.gray };
+    let board = detect_in_gray(gray, &name, target);
+    DetectedImage { name, board }
 }
 
 /// Detects a target in an image. `name` is used in messages.

@@ -1,6 +1,7 @@
 //! `fieldrig calibrate intrinsics`: the lens of a camera from images of a target.
 
-use super::images;
+use super::guide::Purpose;
+use super::images::{self, OtherSize};
 use super::lens::LensFile;
 use super::outputs::{self, ReportFlag, RigFlags, RigOutput};
 use super::scan::ScanOptions;
@@ -163,7 +164,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
 impl Args {
     /// Reads the images and detects the target. `output` gets the calibration that devices report.
     fn detect(&self, keeps_photos: bool, output: Option<&mut RigOutput>) -> anyhow::Result<Detected> {
-        let options = ScanOptions { keeps_photos, is_hidden: self.json, needs_arm: false };
+        let options = ScanOptions { keeps_photos, is_hidden: self.json, purpose: Purpose::Lens };
         let (images, photos, no_images, warnings) =
             match self.rig.read(&self.input, Some(&self.target), options, output)? {
                 Some(mut scan) => (scan.detected(), scan.take_photos(), scan.no_images, scan.warnings),

@@ -1,5 +1,6 @@
 //! `fieldrig calibrate`: calibrates cameras, with a printed target or from images of any static scene.
 
+mod guide;
 mod hand_eye;
 mod images;
 mod intrinsics;

@@ -1,7 +1,8 @@
 //! Images of a target from a recording or from the devices of a rig, as input of `calibrate intrinsics` and `calibrate
 //! hand-eye`.
 
-use super::images::{self, DetectedImage};
+use super::guide::{Guide, Purpose};
+use super::images::{self, DetectedImage, OtherSize};
 use super::outputs::{InputKind, RigFlags, RigOutput};
 use crate::exit::{BadArgument, InsufficientData};
 use crate::{print, signals};
@@ -15,7 +16,7 @@ use kinematics::{Chain, Intrinsics, Stamp, Transform};
 use session::calibration_report::{Photo, Photos, Unused};
 use session::corrected_rig;
 use std::path::Path;
-use targets::{GrayImage, TargetSpec};
+use targets::TargetSpec;
 
 /// Time for which devices are read if no flag limits it, seconds.
 const DEFAULT_SECS: f64 = 30.0;
@@ -46,8 +47,8 @@ pub(super) struct ScanOptions {
     pub(super) keeps_photos: bool,
     /// No progress bars.
     pub(super) is_hidden: bool,
-    /// Rejects rigs without an arm.
-    pub(super) needs_arm: bool,
+    /// What is calibrated. Hand-eye calibration needs an arm.
+    pub(super) purpose: Purpose,
 }
 
 impl RigFlags {
@@ -83,7 +84,7 @@ impl RigFlags {
             }
         };
         let rig = opened.rig.clone();
-        if options.needs_arm && rig.arm.driver == ArmDriver::None {
+        if options.purpose == Purpose::HandEye && rig.arm.driver == ArmDriver::None {
             return Err(BadArgument(format!(
                 "{}: the rig has no arm, which hand-eye calibration needs; without an arm, use `fieldrig calibrate intrinsics`",
                 input.display()
@@ -94,7 +95,7 @@ impl RigFlags {
             output.set_rig(&rig);
         }
         let camera = self.camera_of(&rig)?.clone();
-        let found = self.images(opened, &camera.name, options.is_hidden)?;
+        let (found, detected) = self.images(opened, &camera, target, options)?;
         let warnings = Vec::from_iter(found.damage.clone());
         for warning in &warnings {
             log::warn!("{warning}");
@@ -107,7 +108,10 @@ impl RigFlags {
             found.n_unusable
         );
         let no_images = found.images.is_empty().then(|| no_images(input, &rig, &camera, &found));
-        let scan = Scan::detect(rig, camera, found, target, options)?;
+        let detected = detected.unwrap_or_else(|| {
+            images::detect_each(&found.images, options.is_hidden, |image| images::detect_in_image(image, target))
+        });
+        let scan = Scan::of_images(rig, camera, found, detected, options)?;
         Ok(Some(Scan { no_images, warnings, ..scan }))
     }
 
@@ -117,19 +121,34 @@ impl RigFlags {
         Ok(open::rig(rig, if self.sim { Devices::Sim } else { Devices::Real })?)
     }
 
-    fn images(&self, opened: Opened, camera: &str, is_hidden: bool) -> anyhow::Result<CalibrationImages> {
-        let bar = print::bar(None, "{spinner} {pos} images", is_hidden);
+    /// Reads images. From devices, the target is detected at once, to tell what to do next.
+    fn images(
+        &self,
+        opened: Opened,
+        camera: &Camera,
+        target: &TargetSpec,
+        options: ScanOptions,
+    ) -> anyhow::Result<(CalibrationImages, Option<Vec<DetectedImage>>)> {
         let stop = signals::stop_on_signals_logging("calibrating with the images so far; Ctrl-C again exits at once")?;
         let is_live = !matches!(opened.stamp_clock, capture::StampClock::Unrelated);
+        let template = if is_live { "{spinner} {msg}" } else { "{spinner} {pos} images" };
+        let bar = print::bar(None, template, options.is_hidden);
+        let mut guide = is_live.then(|| Guide::new(target, camera, options.purpose, bar.clone()));
         let limit_secs = if is_live { self.seconds.unwrap_or(DEFAULT_SECS) } else { f64::INFINITY };
         let mut first: Option<Stamp> = None;
         let is_end = |sample: &Sample| {
             let since_first = sample.stamp().secs_since(*first.get_or_insert(sample.stamp()));
             since_first > limit_secs || stop.requested()
         };
-        let found = calibration_images(opened, camera, MAX_SHIFT_PX, is_end, &|n| bar.set_position(n as u64));
+        let mut on_sample = |images: &[CalibrationImage]| {
+            bar.set_position(images.len() as u64);
+            if let Some(guide) = &mut guide {
+                guide.update(images);
+            }
+        };
+        let found = calibration_images(opened, &camera.name, MAX_SHIFT_PX, is_end, &mut on_sample);
         bar.finish_and_clear();
-        Ok(found?)
+        Ok((found?, guide.map(Guide::into_detected)))
     }
 }
 
@@ -154,25 +173,13 @@ fn no_images(input: &Path, rig: &Rig, camera: &Camera, found: &CalibrationImages
 }
 
 impl Scan {
-    fn detect(
+    fn of_images(
         rig: Rig,
         camera: Camera,
         found: CalibrationImages,
-        target: &TargetSpec,
+        detected: Vec<DetectedImage>,
         options: ScanOptions,
     ) -> anyhow::Result<Self> {
-        let detected = images::detect_each(&found.images, options.is_hidden, |image| {
-            let name = format!("image at {:.3} s", image.secs);
-            let gray = GrayImage { size_px: image.size_px, pixels: &image.gray };
-            let board = images::detect_in_gray(gray, &name, target);
-            DetectedImage { name, board }
-        });
-        let base_from_world = rig.base.world_from_base.inverse();
-        let (setup, parent_from_camera) = match camera.parent {
-            Parent::Flange => (Setup::EyeInHand, camera.parent_from_camera),
-            Parent::Base => (Setup::EyeToHand, camera.parent_from_camera),
-            Parent::World => (Setup::EyeToHand, base_from_world * camera.parent_from_camera),
-        };
         let (mut photos, mut images) = (Photos::new(), Vec::new());
         for (image, detected) in found.images.into_iter().zip(detected) {
             let CalibrationImage { size_px, gray, arm, .. } = image;
@@ -181,6 +188,22 @@ impl Scan {
             }
             images.push((detected, arm));
         }
+        Self::new(rig, camera, images, photos)
+    }
+
+    /// Images in which the target was searched, with the state of the arm.
+    pub(super) fn new(
+        rig: Rig,
+        camera: Camera,
+        images: Vec<(DetectedImage, Option<ArmDuringImage>)>,
+        photos: Photos,
+    ) -> anyhow::Result<Self> {
+        let base_from_world = rig.base.world_from_base.inverse();
+        let (setup, parent_from_camera) = match camera.parent {
+            Parent::Flange => (Setup::EyeInHand, camera.parent_from_camera),
+            Parent::Base => (Setup::EyeToHand, camera.parent_from_camera),
+            Parent::World => (Setup::EyeToHand, base_from_world * camera.parent_from_camera),
+        };
         let chain = images.iter().any(|(_, arm)| arm.is_some()).then(|| open::chain_of(&rig)).transpose()?;
         let (no_images, warnings) = (None, Vec::new());
         Ok(Self { rig, camera, setup, parent_from_camera, chain, images, photos, no_images, warnings })

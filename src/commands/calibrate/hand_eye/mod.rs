@@ -1,9 +1,11 @@
 //! `fieldrig calibrate hand-eye`: the pose of a camera on a robot, from images of a target or poses of a board.
 
+mod moved;
 mod printed;
 mod samples_file;
 mod source;
 
+use super::guide::Purpose;
 use super::outputs::{self, ReportFlag, RigFlags, RigOutput};
 use super::scan::ScanOptions;
 use super::target::symmetry_warning;
@@ -15,7 +17,8 @@ use calibration::hand_eye::{
     HandEyeCalibration, HandEyeInput, HandEyeOptions, NextPose, NextPoseOptions, calibrate_hand_eye, suggest_next_poses,
 };
 use kinematics::urdf::Robot;
-use kinematics::{Chain, Intrinsics, Transform};
+use kinematics::{Chain, Intrinsics, Lens, Transform};
+use moved::{MoveFlags, MovedArm, Request};
 use nalgebra::Vector3;
 use printed::{Printed, PrintedPose, PrintedSample};
 use samples_file::{Samples, SamplesFile};
@@ -62,6 +65,8 @@ pub(crate) struct Args {
     #[arg(long, value_name = "LINK", requires = "urdf")]
     tip: Option<String>,
     #[command(flatten)]
+    motion: MoveFlags,
+    #[command(flatten)]
     rig: RigFlags,
     #[command(flatten)]
     report: ReportFlag,
@@ -80,11 +85,24 @@ struct Calibrated {
     rig_pose: Transform,
 }
 
-/// Calibrates and prints the result. Exit code 4 if the samples do not determine it.
+/// Reads or takes the samples, calibrates and prints the result. Exit code 4 if the samples do not determine it.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let report = args.report.open()?;
     let mut rig = args.rig.open(&args.input)?;
-    let mut source = args.source(report.is_some(), rig.as_mut())?;
+    let (source, arm) = args.source(report.is_some(), rig.as_mut())?;
+    let result = calibrate_and_print(args, source, report, rig);
+    match arm {
+        Some(arm) => arm.finish(result),
+        None => result,
+    }
+}
+
+fn calibrate_and_print(
+    args: &Args,
+    mut source: Source,
+    report: Option<&Path>,
+    mut rig: Option<RigOutput>,
+) -> anyhow::Result<Exit> {
     if let Some(rig) = &rig {
         rig.expect_setup(source.setup())?;
     }
@@ -197,21 +215,46 @@ fn write_report(
 }
 
 impl Args {
-    /// Reads the samples file, or the images of a recording or rig. `output` gets the calibration that devices report.
-    fn source(&self, keeps_photos: bool, output: Option<&mut RigOutput>) -> anyhow::Result<Source> {
-        let options = ScanOptions { keeps_photos, is_hidden: self.json, needs_arm: true };
-        let scan = self.rig.read(&self.input, self.target.as_ref(), options, output)?;
+    /// Reads the samples file or the images of a recording or rig, or moves the arm to take images. `output` gets the
+    /// calibration that devices report.
+    fn source(&self, keeps_photos: bool, output: Option<&mut RigOutput>) -> anyhow::Result<(Source, Option<MovedArm>)> {
         let has = |what: &str, flag: &str| BadArgument(format!("{flag}: {}; remove the flag", what));
-        match (scan, &self.target) {
+        let (scan, arm) = if self.motion.is_requested {
+            let (scan, arm) = self.motion.run(&self.request(keeps_photos)?, output)?;
+            (Some(scan), Some(arm))
+        } else {
+            let options = ScanOptions { keeps_photos, is_hidden: self.json, purpose: Purpose::HandEye };
+            (self.rig.read(&self.input, self.target.as_ref(), options, output)?, None)
+        };
+        let source = match (scan, &self.target) {
             (Some(_), _) if self.urdf.is_some() => {
-                Err(has("the rig file names the robot description", "--urdf").into())
+                return Err(has("the rig file names the robot description", "--urdf").into());
             }
-            (Some(scan), Some(target)) => Ok(Source::Scan { scan: Box::new(scan), target: target.clone() }),
-            (None, Some(_)) => Err(has("the samples file contains the target", "--target").into()),
+            (Some(scan), Some(target)) => Source::Scan { scan: Box::new(scan), target: target.clone() },
+            (None, Some(_)) => return Err(has("the samples file contains the target", "--target").into()),
             (_, None) if self.with_joints && self.urdf.is_none() => {
-                Err(BadArgument("--with-joints: with samples in JSON, --urdf and --tip are needed, too".into()).into())
+                let why = "--with-joints: with samples in JSON, --urdf and --tip are needed, too";
+                return Err(BadArgument(why.to_owned()).into());
             }
-            (_, None) => Ok(Source::File(SamplesFile::read(&self.input)?)),
+            (_, None) => Source::File(SamplesFile::read(&self.input)?),
+        };
+        Ok((source, arm))
+    }
+
+    /// What `--move` calibrates.
+    fn request(&self, keeps_photos: bool) -> anyhow::Result<Request<'_>> {
+        let Some(target) = &self.target else {
+            let why = "--target is required with --move, for example --target charuco:5x7:34mm:26mm:5X5_100";
+            return Err(BadArgument(why.to_owned()).into());
+        };
+        Ok(Request { input: &self.input, target, rig: &self.rig, options: self.options(), keeps_photos })
+    }
+
+    fn options(&self) -> HandEyeOptions {
+        HandEyeOptions {
+            estimate_intrinsics: self.with_intrinsics,
+            estimate_joint_offsets: self.with_joints,
+            ..HandEyeOptions::default()
         }
     }
 
@@ -220,17 +263,14 @@ impl Args {
         let symmetries: Vec<Transform> = source.target().map(TargetSpec::symmetry).unwrap_or_default();
         let chain = self.chain()?;
         let intrinsics = source.intrinsics(samples.size_px)?;
+        let intrinsics = if self.with_intrinsics { intrinsics.map(with_distortion) } else { intrinsics };
         let mut input = HandEyeInput {
             setup: source.setup(),
             samples: samples.used.clone(),
             intrinsics: intrinsics.clone(),
             board_symmetries: &symmetries,
             chain: chain.as_ref().or(source.chain()),
-            options: HandEyeOptions {
-                estimate_intrinsics: self.with_intrinsics,
-                estimate_joint_offsets: self.with_joints,
-                ..HandEyeOptions::default()
-            },
+            options: self.options(),
         };
         let symmetry = source.target().and_then(symmetry_warning);
         let mut calibration = calibrate_hand_eye(&input).map_err(|error| with_symmetry(error, symmetry.as_deref()))?;
@@ -259,7 +299,16 @@ impl Args {
     }
 }
 
-fn next_pose_options(target: &TargetSpec) -> NextPoseOptions {
+/// The start of the estimation of a lens. Without distortion, the estimate of a real lens would be wrong by more than its
+/// standard deviation.
+fn with_distortion(given: Intrinsics) -> Intrinsics {
+    match given.lens {
+        Lens::Pinhole => Intrinsics { lens: Lens::BrownConrady([0.0; 5]), ..given },
+        _ => given,
+    }
+}
+
+fn next_pose_options(target: &TargetSpec) -> NextPoseOptions<'static> {
     const N_POSES: usize = 3;
     const MAX_TILT_RAD: f64 = 0.7;
     let [low, high] = target.bounds_m();
@@ -268,5 +317,7 @@ fn next_pose_options(target: &TargetSpec) -> NextPoseOptions {
         center_in_board: Vector3::new(0.5 * (low[0] + high[0]), 0.5 * (low[1] + high[1]), 0.0),
         radius_m: 0.5 * (high[0] - low[0]).hypot(high[1] - low[1]),
         max_tilt_rad: MAX_TILT_RAD,
+        reach: None,
+        seed: 1,
     }
 }

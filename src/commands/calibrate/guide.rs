@@ -1,0 +1,100 @@
+//! Guidance while devices are read: what the images cover so far, and what to do next.
+
+use super::images::{self, DetectedImage};
+use calibration::hand_eye::{HandEyeAdvice, HandEyeGuidance, Setup};
+use calibration::{BoardView, IntrinsicsAdvice, IntrinsicsGuidance};
+use capture::CalibrationImage;
+use capture::config::{Camera, Parent};
+use indicatif::ProgressBar;
+use kinematics::Transform;
+use targets::TargetSpec;
+
+/// What images are taken for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Purpose {
+    /// The lens: corners in all parts of the image, and tilts.
+    Lens,
+    /// The pose of the camera on the robot: rotations.
+    HandEye,
+}
+
+/// Detects the target in each image as it arrives, and prints what to do next: in a progress bar, or as lines if stderr is
+/// not a terminal.
+pub(super) struct Guide<'a> {
+    target: &'a TargetSpec,
+    camera: &'a Camera,
+    purpose: Purpose,
+    bar: ProgressBar,
+    views: Vec<BoardView>,
+    base_from_flange: Vec<Transform>,
+    detected: Vec<DetectedImage>,
+}
+
+impl<'a> Guide<'a> {
+    pub(super) fn new(target: &'a TargetSpec, camera: &'a Camera, purpose: Purpose, bar: ProgressBar) -> Self {
+        let (views, base_from_flange, detected) = (Vec::new(), Vec::new(), Vec::new());
+        let guide = Self { target, camera, purpose, bar, views, base_from_flange, detected };
+        guide.show(&guide.advice());
+        guide
+    }
+
+    /// Detects the target in the images that are new.
+    pub(super) fn update(&mut self, images: &[CalibrationImage]) {
+        for image in &images[self.detected.len()..] {
+            let detected = images::detect_in_image(image, self.target);
+            let text = match &detected.board {
+                Ok(board) => {
+                    self.views.push(board.view.clone());
+                    self.base_from_flange.extend(image.arm.as_ref().map(|arm| arm.base_from_flange));
+                    self.advice()
+                }
+                Err(reason) => format!("{}: {reason}", detected.name),
+            };
+            self.show(&text);
+            self.detected.push(detected);
+        }
+    }
+
+    /// The target in each image.
+    pub(super) fn into_detected(self) -> Vec<DetectedImage> {
+        self.detected
+    }
+
+    fn advice(&self) -> String {
+        let (so_far, advice, is_enough) = match self.purpose {
+            Purpose::Lens => {
+                let guidance = IntrinsicsGuidance::new(&self.views, &self.camera.intrinsics);
+                let percent = 100.0 * guidance.covered_frac;
+                let so_far = match guidance.n_images {
+                    1 => format!("1 image of the target covers {percent:.0} % of the image"),
+                    n => format!("{n} images of the target cover {percent:.0} % of the image"),
+                };
+                (so_far, guidance.advice.to_string(), guidance.advice == IntrinsicsAdvice::Enough)
+            }
+            Purpose::HandEye => {
+                let is_on_flange = self.camera.parent == Parent::Flange;
+                let (setup, body) = match is_on_flange {
+                    true => (Setup::EyeInHand, "camera"),
+                    false => (Setup::EyeToHand, "flange"),
+                };
+                let guidance = HandEyeGuidance::new(&self.base_from_flange, setup, &self.camera.parent_from_camera);
+                let [x, y, z] = guidance.span_deg;
+                let so_far = format!(
+                    "{} with the target, rotated by {x:.0}, {y:.0} and {z:.0} degrees about the {body}'s x, y and z axes",
+                    keyframe::counted(guidance.n_poses as u64, "pose")
+                );
+                (so_far, guidance.advice.to_string(), guidance.advice == HandEyeAdvice::Enough)
+            }
+        };
+        let next = if is_enough { "; press Ctrl-C to end the recording" } else { "" };
+        format!("{so_far}; next: {advice}{next}")
+    }
+
+    fn show(&self, text: &str) {
+        if self.bar.is_hidden() {
+            log::info!("{text}");
+        } else {
+            self.bar.set_message(text.to_owned());
+        }
+    }
+}

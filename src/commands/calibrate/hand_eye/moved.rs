@@ -1,0 +1,292 @@
+//! `fieldrig calibrate hand-eye --move`: the arm itself moves to poses that show the target.
+
+use super::super::images::{self, DetectedImage};
+use super::super::outputs::{self, InputKind, RigFlags, RigOutput};
+use super::super::scan::Scan;
+use super::{next_pose_options, with_distortion};
+use crate::commands::move_arm;
+use crate::exit::{BadArgument, Exit, InsufficientData};
+use crate::signals;
+use calibration::BoardView;
+use calibration::hand_eye::{
+    ArmPlan, ArmPlanOptions, ArmStep, BoardObservation, FirstView, HandEyeInput, HandEyeOptions, HandEyeSample, Reach,
+    Setup, calibrate_hand_eye,
+};
+use capture::config::{ArmDriver, Camera, Parent, Rig};
+use capture::open::{self, Devices};
+use capture::{ArmCapture, ArmDuringImage, CalibrationImage, Stop};
+use drivers::motion::OnLoss;
+use kinematics::{Chain, Transform};
+use session::calibration_report::{Photo, Photos};
+use std::path::Path;
+use targets::{GrayImage, TargetSpec};
+
+/// Largest change of a joint from the start, radians.
+const MAX_JOINT_CHANGE_RAD: f64 = 1.2;
+/// Standard deviation of the rotation at which the result is accurate, degrees.
+const GOAL_DEG: f64 = 0.05;
+
+/// Flags for moving the arm.
+#[derive(Debug, clap::Args)]
+pub(super) struct MoveFlags {
+    /// With a rig file: move the arm to poses that show the target, until the result is accurate. The target must be
+    /// visible at the start; the arm returns there at the end
+    #[arg(long = "move")]
+    pub(super) is_requested: bool,
+    /// With --move: confirm the motion: nobody is within reach of the arm, and a hand is on the emergency stop. Not needed
+    /// with --sim
+    #[arg(long, requires = "is_requested")]
+    enable_motion: bool,
+    /// With --move: maximum number of poses
+    #[arg(long, value_name = "N", default_value_t = 20, requires = "is_requested", value_parser = clap::value_parser!(u16).range(3..=200))]
+    max_poses: u16,
+    /// With --move: end when the standard deviations of the position are this small, millimeters
+    #[arg(long, value_name = "MM", default_value_t = 0.2, requires = "is_requested", value_parser = super::super::super::number_in_range(1e-3..=100.0))]
+    goal_mm: f64,
+    /// With --move: maximum distance of the flange from its position at the start, millimeters
+    #[arg(long, value_name = "MM", default_value_t = 300.0, requires = "is_requested", value_parser = super::super::super::number_in_range(10.0..=5000.0))]
+    max_distance_mm: f64,
+}
+
+/// An arm after it has moved.
+pub(super) struct MovedArm {
+    capture: ArmCapture,
+    stop: Stop,
+    /// Whether the motors hold the arm without this program.
+    is_safe: bool,
+    /// Why the motion was not completed.
+    failure: Option<anyhow::Error>,
+}
+
+impl MovedArm {
+    /// Holds an arm whose motors would release it, until Ctrl-C. Returns the result of the calibration, or why the motion
+    /// was not completed.
+    pub(super) fn finish(mut self, result: anyhow::Result<Exit>) -> anyhow::Result<Exit> {
+        let failure = self.failure.take();
+        match (self.hold(), failure) {
+            (Err(error), None) => Err(error),
+            (_, Some(failure)) => {
+                outputs::log_failure(result.map(|_| ()));
+                Err(failure)
+            }
+            (Ok(()), None) => result,
+        }
+    }
+
+    /// Holds an arm whose motors would release it, until Ctrl-C. An error if the arm has stopped because of a fault.
+    fn hold(&mut self) -> anyhow::Result<()> {
+        if self.is_safe {
+            return Ok(());
+        }
+        log::info!("{}", move_arm::HOLDING);
+        // If Ctrl-C has stopped the motion, the next one ends the program at once.
+        let stop = if self.stop.requested() { Stop::default() } else { self.stop.clone() };
+        Ok(self.capture.hold(&stop)?)
+    }
+}
+
+/// What is calibrated, and how.
+pub(super) struct Request<'a> {
+    pub(super) input: &'a Path,
+    pub(super) target: &'a TargetSpec,
+    pub(super) rig: &'a RigFlags,
+    pub(super) options: HandEyeOptions,
+    pub(super) keeps_photos: bool,
+}
+
+impl MoveFlags {
+    /// Moves the arm and takes images. `output` gets the calibration that devices report.
+    pub(super) fn run(
+        &self,
+        request: &Request<'_>,
+        output: Option<&mut RigOutput>,
+    ) -> anyhow::Result<(Scan, MovedArm)> {
+        let (input, flags) = (request.input.display(), request.rig);
+        flags.check(request.input)?;
+        if InputKind::of(request.input) != InputKind::Rig {
+            return Err(BadArgument(format!("--move needs a rig file (.toml) as input; {input} is none")).into());
+        }
+        if flags.seconds.is_some() {
+            return Err(BadArgument("--seconds: with --move, the arm decides; use --max-poses".to_owned()).into());
+        }
+        let given = Rig::load(request.input, &[])?;
+        let camera = flags.camera_of(&given)?.name.clone();
+        if given.arm.driver == ArmDriver::None {
+            return Err(BadArgument(format!("--move: {input}: the rig has no arm")).into());
+        }
+        let is_simulated = flags.sim || given.arm.driver == ArmDriver::Sim;
+        if !is_simulated {
+            move_arm::motion_of(&given)?;
+            if !self.enable_motion {
+                return Err(BadArgument(
+                    "--move moves the arm: add --enable-motion to confirm that nobody is within reach of the arm and that a hand is on the emergency stop"
+                        .to_owned(),
+                )
+                .into());
+            }
+        }
+        let stop = signals::stop_on_signals_logging("stopping the arm, then calibrating; Ctrl-C again exits at once")?;
+        let devices = if flags.sim { Devices::Sim } else { Devices::Real };
+        let mut capture = ArmCapture::new(open::movable(&given, devices, &camera)?)?;
+        let rig = resolved(&given, capture.rig());
+        if let Some(output) = output.filter(|_| !is_simulated) {
+            output.set_rig(&rig);
+        }
+        let mut camera = flags.camera_of(&rig)?.clone();
+        if request.options.estimate_intrinsics {
+            camera.intrinsics = with_distortion(camera.intrinsics);
+        }
+        let base_or_flange_from_camera = match camera.parent {
+            Parent::World => rig.base.world_from_base.inverse() * camera.parent_from_camera,
+            Parent::Flange | Parent::Base => camera.parent_from_camera,
+        };
+        let (found, photos) = (Vec::new(), Photos::new());
+        let mut images = Images { camera: &camera, base_or_flange_from_camera, request, found, photos };
+        let failure = self.take_images(&mut capture, &mut images, &stop).err();
+        let Images { found, photos, .. } = images;
+        let is_safe = is_simulated || given.arm.motion.as_ref().is_some_and(|motion| motion.on_loss == OnLoss::Hold);
+        let mut arm = MovedArm { capture, stop, is_safe, failure: None };
+        match failure {
+            // Without the target at the start, nothing has moved.
+            Some(error) if found.len() < 2 => {
+                outputs::log_failure(arm.hold());
+                return Err(error);
+            }
+            Some(error) => {
+                log::error!("{error:#}; calibrating with the images so far");
+                arm.failure = Some(error);
+            }
+            None => (),
+        }
+        Ok((Scan::new(rig, camera, found, photos)?, arm))
+    }
+
+    /// Takes images until the plan is finished, then returns to the start. Ctrl-C stops the arm where it is.
+    fn take_images(&self, capture: &mut ArmCapture, images: &mut Images<'_>, stop: &Stop) -> anyhow::Result<()> {
+        let start = capture.joints()?;
+        let chain = capture.chain().clone();
+        let Some(first) = capture.image(stop)? else { return Ok(()) };
+        let view = images.add(first)?;
+        let reach = Reach {
+            chain: &chain,
+            start: &start,
+            max_joint_change: MAX_JOINT_CHANGE_RAD,
+            max_distance_m: 1e-3 * self.max_distance_mm,
+        };
+        // Joint offsets are not part of the plan, so all poses are used for them.
+        let goal_mm = if images.request.options.estimate_joint_offsets { 0.0 } else { self.goal_mm };
+        let goals = ArmPlanOptions { max_poses: self.max_poses.into(), goal_mm, goal_deg: GOAL_DEG };
+        let poses = next_pose_options(images.request.target);
+        let first = FirstView {
+            setup: images.setup(),
+            view: &view,
+            intrinsics: &images.camera.intrinsics,
+            parent_from_camera: &images.base_or_flange_from_camera,
+        };
+        let mut plan = ArmPlan::new(&reach, &poses, &goals, &first);
+        let symmetries = images.request.target.symmetry();
+        loop {
+            let estimate_input = images.hand_eye_input(&chain, &symmetries);
+            let estimate = calibrate_hand_eye(&estimate_input);
+            if let Ok(found) = &estimate {
+                let largest = |sigmas: [f64; 3]| sigmas.into_iter().fold(0.0, f64::max);
+                let (mm, deg) = (largest(found.sigma_mm), largest(found.sigma_deg));
+                log::info!("so far: +- {mm:.2} mm, +- {deg:.3} degrees");
+            }
+            let current = capture.joints()?;
+            let (joints, purpose) = match plan.next(&estimate_input, estimate.as_ref(), &current) {
+                ArmStep::Move { joints, purpose } => (joints, purpose),
+                ArmStep::Finished(why) => {
+                    log::info!("finished: {why}");
+                    break;
+                }
+            };
+            log::info!("moving to pose {}: {purpose}", images.found.len() + 1);
+            if !capture.move_to(&joints, stop)? {
+                return Ok(());
+            }
+            let Some(image) = capture.image(stop)? else { return Ok(()) };
+            match images.add(image) {
+                Ok(_) => plan.seen(),
+                Err(reason) => {
+                    log::info!("pose {}: {reason}", images.found.len());
+                    plan.unseen();
+                }
+            }
+        }
+        log::info!("returning to the start");
+        capture.move_to(&start, stop)?;
+        Ok(())
+    }
+}
+
+/// The given rig with the camera as opened, whose calibration may be stored in the device.
+fn resolved(given: &Rig, opened: &Rig) -> Rig {
+    let mut rig = given.clone();
+    for camera in &mut rig.cameras {
+        if let Some(resolved) = opened.cameras.iter().find(|other| other.name == camera.name) {
+            let driver = camera.driver;
+            *camera = Camera { driver, ..resolved.clone() };
+        }
+    }
+    rig
+}
+
+/// The images so far.
+struct Images<'a> {
+    camera: &'a Camera,
+    base_or_flange_from_camera: Transform,
+    request: &'a Request<'a>,
+    found: Vec<(DetectedImage, Option<ArmDuringImage>)>,
+    photos: Photos,
+}
+
+impl Images<'_> {
+    /// Detects the target in an image. An error if it is not visible.
+    fn add(&mut self, image: CalibrationImage) -> Result<BoardView, InsufficientData> {
+        let n = self.found.len() + 1;
+        let CalibrationImage { size_px, gray, arm, .. } = image;
+        let name = format!("pose {n}");
+        let board = images::detect_in_gray(GrayImage { size_px, pixels: &gray }, &name, self.request.target);
+        let view = match &board {
+            Ok(board) => {
+                log::info!("pose {n}: {} corners", board.view.points.len());
+                Ok(board.view.clone())
+            }
+            Err(reason) if n == 1 => Err(InsufficientData(format!(
+                "the target is not visible at the start: {reason}; move the arm so that the camera sees the whole target, then start again"
+            ))),
+            Err(reason) => Err(InsufficientData(format!("the target is not visible: {reason}"))),
+        };
+        if self.request.keeps_photos {
+            self.photos.insert(name.clone(), Photo::Gray { size_px, pixels: gray });
+        }
+        self.found.push((DetectedImage { name, board }, arm));
+        view
+    }
+
+    fn setup(&self) -> Setup {
+        if self.camera.parent == Parent::Flange { Setup::EyeInHand } else { Setup::EyeToHand }
+    }
+
+    /// Input of the calibration so far.
+    fn hand_eye_input<'a>(&self, chain: &'a Chain, symmetries: &'a [Transform]) -> HandEyeInput<'a> {
+        let sample = |(image, arm): &(DetectedImage, Option<ArmDuringImage>)| {
+            let (board, arm) = (image.board.as_ref().ok()?, arm.as_ref()?);
+            Some(HandEyeSample {
+                name: image.name.clone(),
+                base_from_flange: arm.base_from_flange,
+                board: BoardObservation::View(board.view.clone()),
+                joints: Some(arm.joints.clone()),
+            })
+        };
+        HandEyeInput {
+            setup: self.setup(),
+            samples: self.found.iter().filter_map(sample).collect(),
+            intrinsics: Some(self.camera.intrinsics.clone()),
+            board_symmetries: symmetries,
+            chain: Some(chain),
+            options: ArmPlan::estimate_options(&self.request.options),
+        }
+    }
+}
