@@ -129,15 +129,15 @@ fn advice(views: &[BoardView], coverage: &ImageGrid<usize>, intrinsics: &Intrins
 /// Fraction of the cells with corners among those whose centers are in a part of the image.
 fn covered_frac(coverage: &ImageGrid<usize>, [columns, rows]: [[f64; 2]; 2]) -> f64 {
     let is_inside = |ix: usize, n: usize, [low, high]: [f64; 2]| (low..high).contains(&((ix as f64 + 0.5) / n as f64));
-    let (mut n, mut n_covered) = (0, 0);
+    let (mut n, mut n_covered) = (0_u32, 0_u32);
     for (ix, value) in coverage.values.iter().enumerate() {
         let (column, row) = (ix % coverage.n_columns, ix / coverage.n_columns);
         if is_inside(column, coverage.n_columns, columns) && is_inside(row, coverage.n_rows, rows) {
             n += 1;
-            n_covered += usize::from(*value > 0);
+            n_covered += u32::from(*value > 0);
         }
     }
-    f64::from(n_covered as u32) / f64::from(n.max(1))
+    f64::from(n_covered) / f64::from(n.max(1))
 }
 
 /// Rotation of the target about the x and the y axis of the camera relative to facing it, degrees. A positive angle about y
