@@ -119,15 +119,15 @@ pub(super) fn report(
     let covariance = position_first(&refined.covariance.fixed_view::<6, 6>(0, 0).into_owned());
     let sigma = |first: usize| [0, 1, 2].map(|axis| sigma_of(covariance[(first + axis, first + axis)]));
     let mut samples = sample_reports(input, refined);
+    debug_assert_eq!(refined.samples.len() + without_board.len() + repeated.len(), samples.len());
+    for ix in repeated {
+        samples[*ix].status = SampleStatus::Repeated;
+    }
     let rms_all_px = rms_px(input, refined, |_| Some(refined.solution));
     let mut warnings = problems(input, refined, &samples);
     // Contradicting intrinsics are the more precise explanation.
     if refined.intrinsics_doubt.is_none() {
         warnings.extend(error_sources::warning(&refined.noise, scatter, rms_all_px));
-    }
-    debug_assert_eq!(refined.samples.len() + without_board.len() + repeated.len(), samples.len());
-    for ix in repeated {
-        samples[*ix].status = SampleStatus::Repeated;
     }
     Ok(HandEyeCalibration {
         setup: input.setup,
