@@ -40,6 +40,7 @@ mod projection;
 pub mod quantile;
 pub mod random;
 mod rounding;
+pub mod shape;
 pub mod stamp;
 pub mod transform;
 pub mod undistort;

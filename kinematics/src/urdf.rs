@@ -1,5 +1,6 @@
 //! Parses URDF text into a checked tree of links and joints.
 
+use crate::shape::{self, Shape};
 use crate::{Error, Transform};
 use nalgebra::{Translation3, Unit, UnitQuaternion, Vector3};
 use std::collections::HashMap;
@@ -13,6 +14,15 @@ pub struct Robot {
     joints: Vec<Joint>,
     /// Index of each link's parent joint.
     joint_above: HashMap<String, usize>,
+    /// Visual and collision shapes of each link that has any.
+    shapes: HashMap<String, LinkShapes>,
+    ignored_shapes: Vec<String>,
+}
+
+#[derive(Clone, Debug, Default)]
+struct LinkShapes {
+    visuals: Vec<Shape>,
+    collisions: Vec<Shape>,
 }
 
 /// One joint between two links.
@@ -80,12 +90,13 @@ impl Robot {
         if parsed.links.is_empty() {
             return Err(Error::NoLinks { robot: parsed.name });
         }
+        let (shapes, ignored_shapes) = shapes(&parsed);
         let links: Vec<String> = parsed.links.into_iter().map(|link| link.name).collect();
         let joints = parsed.joints.iter().map(joint).collect::<Result<Vec<_>, _>>()?;
         reject_duplicates("link", links.iter())?;
         reject_duplicates("joint", joints.iter().map(|joint| &joint.name))?;
         let joint_above = joints_above(&links, &joints)?;
-        let robot = Self { name: parsed.name, links, joints, joint_above };
+        let robot = Self { name: parsed.name, links, joints, joint_above, shapes, ignored_shapes };
         robot.reject_cycles()?;
         Ok(robot)
     }
@@ -103,6 +114,21 @@ impl Robot {
     /// All joints, in file order.
     pub fn joints(&self) -> &[Joint] {
         &self.joints
+    }
+
+    /// Visual shapes of a link, without invalid ones.
+    pub fn visuals(&self, link: &str) -> &[Shape] {
+        self.shapes.get(link).map_or(&[], |shapes| &shapes.visuals)
+    }
+
+    /// Collision shapes of a link, without invalid ones.
+    pub fn collisions(&self, link: &str) -> &[Shape] {
+        self.shapes.get(link).map_or(&[], |shapes| &shapes.collisions)
+    }
+
+    /// One sentence for each invalid shape. Kinematics do not depend on shapes, so these are no errors.
+    pub fn ignored_shapes(&self) -> &[String] {
+        &self.ignored_shapes
     }
 
     /// The joint with this name.
@@ -160,6 +186,28 @@ impl Robot {
         }
         Ok(())
     }
+}
+
+/// The valid shapes of all links, and the reasons why the others are invalid.
+fn shapes(parsed: &urdf_rs::Robot) -> (HashMap<String, LinkShapes>, Vec<String>) {
+    let (mut by_link, mut ignored) = (HashMap::<String, LinkShapes>::new(), Vec::new());
+    for link in &parsed.links {
+        let mut valid = |kind: &str, shapes: Vec<Result<Shape, String>>| -> Vec<Shape> {
+            let keep = |shape: Result<Shape, String>| {
+                shape
+                    .map_err(|why| ignored.push(format!("a {kind} shape of link {:?} is ignored: {why}", link.name)))
+                    .ok()
+            };
+            shapes.into_iter().filter_map(keep).collect()
+        };
+        let visuals = link.visual.iter().map(|parsed_shape| shape::visual(parsed_shape, &parsed.materials)).collect();
+        let visuals = valid("visual", visuals);
+        let collisions = valid("collision", link.collision.iter().map(shape::collision).collect());
+        if !visuals.is_empty() || !collisions.is_empty() {
+            by_link.insert(link.name.clone(), LinkShapes { visuals, collisions });
+        }
+    }
+    (by_link, ignored)
 }
 
 fn one_line(error: &urdf_rs::UrdfError) -> String {
