@@ -12,4 +12,4 @@ if ! command -v chromium >/dev/null 2>&1 && ! command -v chromium-browser >/dev/
     exit 0
 fi
 scripts/build-web.sh
-cargo test -p viz --test page -- --nocapture
+cargo test -p viz --test page --test robot_page -- --nocapture

@@ -3,6 +3,7 @@
 
 use crate::error::{Context, Error};
 use crate::join::{Change, Join, JoinEvent, PosedImage};
+use crate::robot_motion::RobotMotion;
 use crate::stamp_clock::StampClock;
 use crate::stations::Stations;
 use crate::stop::Stop;
@@ -44,13 +45,32 @@ pub struct FeedItem {
     pub times: Option<InputTimes>,
 }
 
-/// Receives the camera images of a running input, for example to show them.
-pub trait ImageObserver: Send {
+/// Receives the camera images and the motion of the robot from a running input, for example to show them.
+pub trait InputObserver: Send {
     /// Whether images are needed. If not, they are not decoded.
     fn needs_images(&self) -> bool;
 
     /// Receives an image.
     fn observe(&self, image: ObservedImage);
+
+    /// Whether the motion of the robot is needed.
+    fn needs_robot(&self) -> bool;
+
+    /// Receives a reading of the robot.
+    fn observe_robot(&self, robot: ObservedRobot);
+}
+
+/// Joint positions and base pose of the robot at one time.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ObservedRobot {
+    /// Time of the reading.
+    pub stamp: Stamp,
+    /// The same time on this process's clock; the time of arrival if the stamp comes from another clock.
+    pub captured_at: Instant,
+    /// Pose of the base, with the correction of its station.
+    pub world_from_base: Transform,
+    /// Positions of [`Arm::joints`](crate::config::Arm::joints), radians or meters.
+    pub positions: Vec<f64>,
 }
 
 /// A camera image as received from the device, with its pose.
@@ -101,6 +121,8 @@ pub struct Input {
     pub stations: Option<Stations>,
     /// Records all samples; `None` if the run is not recorded.
     pub recorder: Option<Recorder>,
+    /// Follows the robot for viewers.
+    pub robot_motion: RobotMotion,
     /// The clock of the stamps.
     pub stamp_clock: StampClock,
     /// Focal length and principal point of every camera, pixels.
@@ -133,7 +155,7 @@ impl Feed {
     /// # Errors
     ///
     /// If no thread can be started.
-    pub fn start(input: Input, observer: Box<dyn ImageObserver>, stop: Stop) -> crate::Result<Self> {
+    pub fn start(input: Input, observer: Box<dyn InputObserver>, stop: Stop) -> crate::Result<Self> {
         let (sender, changes) = sync_channel(MAX_WAITING);
         let shared = Arc::new(Shared::default());
         let pump = Pump { input, observer, stop, sender, shared: shared.clone(), arrivals: VecDeque::new() };
@@ -192,7 +214,7 @@ impl Feed {
 
 struct Pump {
     input: Input,
-    observer: Box<dyn ImageObserver>,
+    observer: Box<dyn InputObserver>,
     stop: Stop,
     sender: SyncSender<FeedItem>,
     shared: Arc<Shared>,
@@ -237,6 +259,7 @@ impl Pump {
                     self.arrivals.drain(..self.arrivals.len().saturating_sub(MAX_ARRIVALS));
                 }
             }
+            self.publish_robot(&sample);
             let newest = sample.stamp();
             let events = self.input.join.push(sample);
             let newest = self.input.join.shifted(newest);
@@ -350,7 +373,22 @@ impl Pump {
         });
     }
 
-    /// Time at which an image was captured, or now if its stamp is on another clock (recordings, simulations).
+    /// Passes a reading of the robot to the observer.
+    fn publish_robot(&mut self, sample: &Sample) {
+        let Some(reading) = self.input.robot_motion.push(sample).filter(|_| self.observer.needs_robot()) else {
+            return;
+        };
+        let stations = self.input.stations.as_ref();
+        self.observer.observe_robot(ObservedRobot {
+            stamp: reading.stamp,
+            captured_at: self.captured_at(reading.stamp),
+            world_from_base: stations
+                .map_or(reading.world_from_base, |stations| stations.corrected_base(&reading.world_from_base)),
+            positions: reading.positions,
+        });
+    }
+
+    /// Time at which a sample was captured, or now if its stamp is on another clock (recordings, simulations).
     fn captured_at(&self, stamp: Stamp) -> Instant {
         self.input.stamp_clock.instant_of(stamp).unwrap_or_else(Instant::now)
     }

@@ -40,6 +40,7 @@ mod join;
 mod nearest_name;
 mod notes;
 pub mod open;
+mod robot_motion;
 mod stamp_clock;
 mod stations;
 mod stop;
@@ -52,10 +53,13 @@ pub use arm_capture::ArmCapture;
 pub use calibration_images::{ArmDuringImage, CalibrationImage, CalibrationImages, calibration_images};
 pub use config::{ConfigError, Override, Rig};
 pub use error::{Error, Result};
-pub use feed::{Feed, FeedItem, ImageObserver, Input, InputResult, InputTimes, ObservedImage, ObservedPixels};
+pub use feed::{
+    Feed, FeedItem, Input, InputObserver, InputResult, InputTimes, ObservedImage, ObservedPixels, ObservedRobot,
+};
 pub use join::{Change, Counts, Join, JoinEvent, PosedImage, Rejection, SampleUse};
 pub use nearest_name::nearest_name;
 pub use notes::Notes;
+pub use robot_motion::{RobotMotion, RobotReading};
 pub use stamp_clock::StampClock;
 pub use stations::{StationReport, Stations};
 pub use stop::Stop;

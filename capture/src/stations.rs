@@ -179,6 +179,11 @@ impl Stations {
         if self.carried.contains(camera) { self.map_from_odom * world_from_camera } else { *world_from_camera }
     }
 
+    /// Applies the current correction to a reported base pose.
+    pub(crate) fn corrected_base(&self, world_from_base: &Transform) -> Transform {
+        self.map_from_odom * world_from_base
+    }
+
     /// Reports on all stations after the first.
     #[must_use]
     pub fn reports(&self) -> &[StationReport] {

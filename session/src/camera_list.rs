@@ -5,7 +5,7 @@ use crate::error::Context;
 use crate::{camera_path, run_folder};
 use calibration::CalibratedCamera;
 use keyframe::{Keyframe, split_name};
-use kinematics::Transform;
+use kinematics::{Stamp, Transform};
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 use std::sync::Arc;
@@ -82,6 +82,7 @@ pub fn read(folder: &Path) -> crate::Result<Option<Vec<KeyframePose>>> {
         })?;
         Ok(KeyframePose {
             camera: camera.camera.into(),
+            stamp: Stamp(camera.stamp_nanos),
             world_from_camera,
             size_px: camera.size_px,
             focal_px: camera.focal_px,

@@ -48,6 +48,7 @@ pub mod recovery;
 mod render_budget;
 mod replay;
 mod report;
+pub mod robot_meshes;
 pub mod run_folder;
 mod scene_calibration;
 pub mod scene_hint;

@@ -130,6 +130,7 @@ impl Live {
             (keyframe.camera.clone(), keyframe.world_from_camera.inverse() * camera.world_from_camera)
         };
         self.hub.set_camera_corrections(posed().map(correction).collect());
+        self.hub.set_keyframe_sources(&self.keyframes);
         self.hub.set_keyframes(posed().map(|(keyframe, camera)| frustum(keyframe, camera)).collect());
         self.published_cameras = cameras;
     }
@@ -576,6 +577,7 @@ fn model_status(session: &Session) -> ModelStatus {
 fn frustum(keyframe: &Keyframe, camera: &CalibratedCamera) -> KeyframePose {
     KeyframePose {
         camera: keyframe.camera.clone(),
+        stamp: keyframe.stamp,
         world_from_camera: camera.world_from_camera,
         size_px: keyframe.size_px,
         focal_px: camera.focal_px,

@@ -1,12 +1,12 @@
-//! Passes camera images to viewers.
+//! Passes camera images and the motion of the robot to viewers.
 
-use capture::{ImageObserver, ObservedImage, ObservedPixels};
-use viz::{Hub, LiveImage, LivePixels};
+use capture::{InputObserver, ObservedImage, ObservedPixels, ObservedRobot};
+use viz::{Hub, LiveImage, LivePixels, RobotState};
 
-/// An observer of a run's input that passes images to the clients of a hub.
+/// An observer of a run's input that passes it to the clients of a hub.
 pub struct Viewers(pub Hub);
 
-impl ImageObserver for Viewers {
+impl InputObserver for Viewers {
     fn needs_images(&self) -> bool {
         self.0.n_clients() > 0
     }
@@ -24,6 +24,19 @@ impl ImageObserver for Viewers {
             world_from_camera: Some(image.world_from_camera),
             focal_px: image.focal_px,
             principal_px: image.principal_px,
+        });
+    }
+
+    fn needs_robot(&self) -> bool {
+        self.0.needs_robot_state()
+    }
+
+    fn observe_robot(&self, robot: ObservedRobot) {
+        self.0.set_robot_state(RobotState {
+            stamp: robot.stamp,
+            captured_at: robot.captured_at,
+            world_from_base: robot.world_from_base,
+            positions: robot.positions,
         });
     }
 }

@@ -12,7 +12,8 @@ use capture::config::{ArmDriver, Override, Rig};
 use capture::doctor;
 use capture::open::{self, Devices, Opened};
 use capture::{
-    Counts, Feed, Input, InputResult, Join, Notes, Rejection, SampleUse, StampClock, StationReport, Stations, Stop,
+    Counts, Feed, Input, InputResult, Join, Notes, Rejection, RobotMotion, SampleUse, StampClock, StationReport,
+    Stations, Stop,
 };
 use drivers::Source;
 use keyframe::{Keyframe, Split, counted};
@@ -24,7 +25,7 @@ use session::run_folder::{self, CreatedFolders};
 use session::{
     AvailableData, Checkpoints, Clock, DecisionLog, EndingSession, Evaluator, Evaluators, FinishedModel, Limits, Live,
     LiveOptions, ModelViewer, Pace, REALIGN, Recovery, RefineSettings, RunDescription, RunFlags, ServedModel, Session,
-    Settings, StoredKeyframes, Viewers, checkpoints, corrected_rig, methods_of, recovery,
+    Settings, StoredKeyframes, Viewers, checkpoints, corrected_rig, methods_of, recovery, robot_meshes,
 };
 use std::collections::BTreeMap;
 use std::io::IsTerminal;
@@ -347,6 +348,9 @@ pub(super) fn start(
     let folders = created.make_each(args.out(), &kinds, Some(&rig))?;
     let held = previous.map_or(&[][..], |previous| &previous.keyframes);
     let (input, evicted) = args.input(&rig, (source, stamp_clock), held)?;
+    if let Some(robot) = robot_meshes::description(&rig, &args.rig_file)? {
+        hub.set_robot(robot);
+    }
     let feed = Feed::start(input, Box::new(Viewers(hub.clone())), stop.clone())?;
     let notes = notes(&gpu);
     let evaluators = Evaluators {
@@ -703,6 +707,7 @@ impl Args {
             join,
             stations: Stations::new(rig).map(|stations| stations.resume_from(previous)),
             recorder: self.record.as_deref().map(|file| open::recorder(file, rig)).transpose()?,
+            robot_motion: RobotMotion::new(rig),
             stamp_clock,
             camera_intrinsics: rig
                 .cameras

@@ -8,6 +8,7 @@ use std::collections::BTreeMap;
 use std::io;
 use std::pin::Pin;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::task::{Context, Poll, Waker};
 use std::time::{Duration, Instant};
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
@@ -80,6 +81,8 @@ struct Registry {
 #[derive(Debug)]
 pub(crate) struct Connection {
     number: u64,
+    /// Size that the kernel's send buffer should have, bytes; 0 if it should not change.
+    send_buffer_bytes: AtomicUsize,
     state: Mutex<ConnectionState>,
 }
 
@@ -199,7 +202,7 @@ impl Connection {
             opened: Instant::now(),
             client: None,
         };
-        Self { number, state: Mutex::new(state) }
+        Self { number, send_buffer_bytes: AtomicUsize::new(0), state: Mutex::new(state) }
     }
 
     /// Records that a complete request has arrived.
@@ -212,6 +215,18 @@ impl Connection {
         if let Some(client) = &mut self.state().client {
             client.last_message = Some(Instant::now());
         }
+    }
+
+    /// Time since the client's last message, or since it was admitted.
+    pub(crate) fn silence(&self) -> Duration {
+        let state = self.state();
+        let client = state.client.as_ref();
+        client.map_or(Duration::ZERO, |client| client.last_message.unwrap_or(client.admitted).elapsed())
+    }
+
+    /// Sets the size of the kernel's send buffer from the next write on.
+    pub(crate) fn set_send_buffer(&self, n_bytes: usize) {
+        self.send_buffer_bytes.store(n_bytes, Ordering::Relaxed);
     }
 
     /// Returns whether a ping is due. At most one ping is unanswered at a time.
@@ -302,6 +317,21 @@ impl GuardedStream {
         &self.connection
     }
 
+    /// Applies [`Connection::set_send_buffer`]. A failure affects only latency.
+    #[cfg(unix)]
+    fn resize_send_buffer(&self) {
+        let n_bytes = self.connection.send_buffer_bytes.swap(0, Ordering::Relaxed);
+        if n_bytes == 0 {
+            return;
+        }
+        if let Err(error) = rustix::net::sockopt::set_socket_send_buffer_size(&self.stream, n_bytes) {
+            log::debug!("cannot resize a socket's buffer: {error}");
+        }
+    }
+
+    #[cfg(not(unix))]
+    fn resize_send_buffer(&self) {}
+
     /// Runs a write unless the connection is closed, and records whether the peer reads.
     fn write(
         &mut self,
@@ -311,6 +341,7 @@ impl GuardedStream {
         if self.connection.state().is_closed {
             return Poll::Ready(Err(io::ErrorKind::ConnectionAborted.into()));
         }
+        self.resize_send_buffer();
         let written = write(Pin::new(&mut self.stream), context);
         let mut state = self.connection.state();
         match &written {

@@ -2,8 +2,13 @@
 
 use crate::Hub;
 use crate::clock::ServerClock;
+use crate::hub::Demand;
+use crate::keyframe_log::KeyframeLog;
+use crate::keyframe_points::pack_points;
 use crate::picture::pack_live_image;
-use crate::protocol::{KeyframeMessage, ServerMessage};
+use crate::robot::RobotMessage;
+use crate::server_message::{KeyframeMessage, ServerMessage};
+use crate::subscriptions::fitted;
 use crate::updates::LiveImage;
 use axum::extract::ws::Message;
 use std::collections::BTreeMap;
@@ -14,69 +19,53 @@ use tokio::task::JoinSet;
 
 /// Period of checking the hub for new data.
 const CHECK_PERIOD: Duration = Duration::from_millis(20);
-/// Minimum period between status messages, and between images of one camera.
-const UPDATE_PERIOD: Duration = Duration::from_millis(190);
-/// Minimum period between keyframe lists, which are long and always sent in full.
-const KEYFRAMES_PERIOD: Duration = Duration::from_secs(1);
+/// Minimum period between status messages.
+const STATUS_PERIOD: Duration = Duration::from_millis(100);
+/// Minimum period between versions of the keyframe list.
+const KEYFRAMES_PERIOD: Duration = Duration::from_millis(200);
+/// Minimum period between complete keyframe lists, which are long.
+const KEYFRAME_LIST_PERIOD: Duration = Duration::from_millis(950);
 
 /// The latest encoded message of each kind.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct LatestMessages {
-    scene: Option<Item>,
-    status: Option<Item>,
-    keyframes: Option<Item>,
-    live_images: BTreeMap<Arc<str>, Item>,
+    pub(crate) scene: Option<Item>,
+    pub(crate) status: Option<Item>,
+    pub(crate) robot: Option<Item>,
+    /// The complete list, if a client needs it.
+    pub(crate) keyframe_list: Option<Item>,
+    /// The source of changes of the list; `None` before the first list.
+    pub(crate) keyframe_log: Option<Arc<KeyframeLog>>,
+    pub(crate) live_images: BTreeMap<ImageKey, Item>,
+    /// Points of keyframes by number, if a client draws them; `None` for keyframes without points.
+    pub(crate) keyframe_points: BTreeMap<u64, Option<Message>>,
 }
+
+/// Camera and maximum size of a live image.
+pub(crate) type ImageKey = (Arc<str>, [u32; 2]);
 
 /// An encoded message; clones share the bytes.
 #[derive(Clone, Debug)]
-struct Item {
-    number: u64,
-    message: Message,
-}
-
-/// Numbers of the items that a client has received.
-#[derive(Debug, Default)]
-pub(crate) struct Received {
-    scene: u64,
-    status: u64,
-    keyframes: u64,
-    live_images: BTreeMap<Arc<str>, u64>,
+pub(crate) struct Item {
+    pub(crate) number: u64,
+    pub(crate) message: Message,
 }
 
 impl LatestMessages {
-    /// The next message that a client has not received: short messages first, live images and keyframes only if
-    /// `long` is set.
-    pub(crate) fn next(&self, received: &mut Received, long: bool) -> Option<Message> {
-        let newer = |item: &Option<Item>, number: &mut u64| {
-            let item = item.as_ref().filter(|item| item.number > *number)?;
-            *number = item.number;
-            Some(item.message.clone())
-        };
-        let short = newer(&self.scene, &mut received.scene).or_else(|| newer(&self.status, &mut received.status));
-        if short.is_some() || !long {
-            return short;
-        }
-        // The camera whose last image was sent longest ago comes first.
-        let number_of = |camera: &Arc<str>| received.live_images.get(camera).copied().unwrap_or(0);
-        let waiting = self.live_images.iter().filter(|(camera, item)| item.number > number_of(camera));
-        let image = waiting.min_by_key(|(camera, _)| number_of(camera));
-        if let Some((camera, item)) = image {
-            received.live_images.insert(Arc::clone(camera), item.number);
-            return Some(item.message.clone());
-        }
-        newer(&self.keyframes, &mut received.keyframes)
-    }
-
     fn is_empty(&self) -> bool {
-        self.scene.is_none() && self.status.is_none() && self.keyframes.is_none() && self.live_images.is_empty()
+        self.scene.is_none()
+            && self.status.is_none()
+            && self.robot.is_none()
+            && self.keyframe_log.is_none()
+            && self.live_images.is_empty()
     }
 }
 
 /// The result of a finished encoding task.
 enum Encoded {
-    Keyframes(Message),
-    LiveImage(Arc<str>, Message),
+    KeyframeList(Message),
+    LiveImage(ImageKey, Message),
+    Points(u64, Option<Message>),
 }
 
 /// The image of a camera that is being encoded or was encoded last.
@@ -87,22 +76,27 @@ struct ImageEncoding {
 }
 
 /// Encodes new data while clients are connected. Runs until the server stops.
-pub(crate) async fn broadcast(hub: Hub, clock: ServerClock, latest_messages: watch::Sender<LatestMessages>) {
-    let (mut scene, mut status, mut keyframes, live_images) =
-        (hub.scene(), hub.status(), hub.keyframes(), hub.live_images());
+pub(crate) async fn broadcast(hub: Hub, clock: ServerClock, latest_messages_sender: watch::Sender<LatestMessages>) {
+    let (mut scene, mut status, mut robot, mut keyframes, live_images) =
+        (hub.scene(), hub.status(), hub.robot(), hub.keyframes(), hub.live_images());
     // A client may connect before the first check, and it has not received what was set earlier.
     scene.mark_changed();
     status.mark_changed();
+    robot.mark_changed();
     keyframes.mark_changed();
-    let mut status_sent = Throttle::new(UPDATE_PERIOD);
+    let mut status_sent = Throttle::new(STATUS_PERIOD);
     let mut keyframes_sent = Throttle::new(KEYFRAMES_PERIOD);
-    let mut image_encodings: BTreeMap<Arc<str>, ImageEncoding> = BTreeMap::new();
+    let mut list_sent = Throttle::new(KEYFRAME_LIST_PERIOD);
+    let mut keyframe_log = KeyframeLog::default();
+    let mut is_list_outdated = true;
+    let mut is_encoding_list = false;
+    let mut is_encoding_points = false;
+    let mut image_encodings: BTreeMap<ImageKey, ImageEncoding> = BTreeMap::new();
     let mut encodings: JoinSet<Encoded> = JoinSet::new();
-    let mut is_encoding_keyframes = false;
     let mut n_items = 0;
     let mut publish_item = |change: &dyn Fn(&mut LatestMessages, u64)| {
         n_items += 1;
-        latest_messages.send_modify(|latest_messages| change(latest_messages, n_items));
+        latest_messages_sender.send_modify(|latest_messages| change(latest_messages, n_items));
     };
     let mut check = tokio::time::interval(CHECK_PERIOD);
     check.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
@@ -110,43 +104,61 @@ pub(crate) async fn broadcast(hub: Hub, clock: ServerClock, latest_messages: wat
         tokio::select! {
             _ = check.tick() => {}
             Some(encoded) = encodings.join_next() => match encoded {
-                Ok(Encoded::Keyframes(message)) => {
-                    is_encoding_keyframes = false;
-                    publish_item(&|latest_messages, number| latest_messages.keyframes = Some(Item { number, message: message.clone() }));
+                Ok(Encoded::KeyframeList(message)) => {
+                    is_encoding_list = false;
+                    publish_item(&|latest_messages, number| {
+                        latest_messages.keyframe_list = Some(Item { number, message: message.clone() });
+                    });
                 }
-                Ok(Encoded::LiveImage(camera, message)) => {
-                    if let Some(image_encodings) = image_encodings.get_mut(&camera) {
-                        image_encodings.is_running = false;
+                Ok(Encoded::LiveImage(key, message)) => {
+                    if let Some(image_encoding) = image_encodings.get_mut(&key) {
+                        image_encoding.is_running = false;
                     }
                     publish_item(&|latest_messages, number| {
-                        latest_messages.live_images.insert(Arc::clone(&camera), Item { number, message: message.clone() });
+                        latest_messages.live_images.insert(key.clone(), Item { number, message: message.clone() });
+                    });
+                }
+                Ok(Encoded::Points(number, message)) => {
+                    is_encoding_points = false;
+                    publish_item(&|latest_messages, _| {
+                        latest_messages.keyframe_points.insert(number, message.clone());
                     });
                 }
                 Err(error) => {
                     log::error!("cannot encode a message for clients: {error}");
                     // It is not known which message failed, so all kinds may be encoded again when they change.
-                    is_encoding_keyframes = false;
-                    image_encodings.values_mut().for_each(|image_encodings| image_encodings.is_running = false);
+                    (is_encoding_list, is_encoding_points) = (false, false);
+                    image_encodings.values_mut().for_each(|image_encoding| image_encoding.is_running = false);
                 }
             },
         }
         if hub.n_clients() == 0 {
-            if !latest_messages.borrow().is_empty() {
-                latest_messages.send_replace(LatestMessages::default());
+            if !latest_messages_sender.borrow().is_empty() {
+                latest_messages_sender.send_replace(LatestMessages::default());
             }
             // The next client receives everything.
             scene.mark_changed();
             status.mark_changed();
+            robot.mark_changed();
             keyframes.mark_changed();
-            image_encodings.retain(|_, image_encodings| image_encodings.is_running);
+            is_list_outdated = true;
+            image_encodings.retain(|_, image_encoding| image_encoding.is_running);
             status_sent.reset();
             keyframes_sent.reset();
+            list_sent.reset();
             continue;
         }
+        let demands = hub.demands();
         if let Some(hint) = take_if_changed(&mut scene).flatten() {
             let message = text(&ServerMessage::from(&*hint));
             publish_item(&|latest_messages, number| {
-                latest_messages.scene = Some(Item { number, message: message.clone() })
+                latest_messages.scene = Some(Item { number, message: message.clone() });
+            });
+        }
+        if let Some(robot) = take_if_changed(&mut robot).flatten() {
+            let message = text(&ServerMessage::Robot(&RobotMessage::from(&*robot)));
+            publish_item(&|latest_messages, number| {
+                latest_messages.robot = Some(Item { number, message: message.clone() });
             });
         }
         if status_sent.is_due()
@@ -155,45 +167,93 @@ pub(crate) async fn broadcast(hub: Hub, clock: ServerClock, latest_messages: wat
             status_sent.begin();
             let message = text(&ServerMessage::Status(&latest));
             publish_item(&|latest_messages, number| {
-                latest_messages.status = Some(Item { number, message: message.clone() })
+                latest_messages.status = Some(Item { number, message: message.clone() });
             });
         }
         if keyframes_sent.is_due()
-            && !is_encoding_keyframes
             && let Some(list) = take_if_changed(&mut keyframes)
         {
             keyframes_sent.begin();
-            is_encoding_keyframes = true;
-            encodings.spawn_blocking(move || {
-                let keyframes = list.iter().map(KeyframeMessage::from).collect();
-                Encoded::Keyframes(text(&ServerMessage::Keyframes { keyframes }))
+            keyframe_log.set(&list);
+            is_list_outdated = true;
+            let log = Arc::new(keyframe_log.clone());
+            publish_item(&|latest_messages, _| {
+                latest_messages.keyframe_points.retain(|number, _| log.contains(*number));
+                latest_messages.keyframe_log = Some(Arc::clone(&log));
             });
         }
-        for (camera, image) in &*live_images.borrow() {
-            let is_new = image_encodings.get(camera).is_none_or(|image_encodings| {
-                !image_encodings.is_running
-                    && image_encodings.at.elapsed() >= UPDATE_PERIOD
-                    && !Arc::ptr_eq(&image_encodings.image, image)
+        let needs_list = demands.iter().any(|demand| !demand.has_keyframe_changes);
+        if needs_list && is_list_outdated && !is_encoding_list && list_sent.is_due() {
+            list_sent.begin();
+            (is_list_outdated, is_encoding_list) = (false, true);
+            let list = keyframes.borrow().clone();
+            encodings.spawn_blocking(move || {
+                let keyframes = list.iter().map(KeyframeMessage::from).collect();
+                Encoded::KeyframeList(text(&ServerMessage::Keyframes { keyframes }))
+            });
+        }
+        let needs_points = demands.iter().any(|demand| demand.subscriptions.keyframe_points.is_some());
+        if needs_points && !is_encoding_points {
+            let latest = latest_messages_sender.borrow();
+            let next = keyframe_log.newest_first().find(|(number, _)| !latest.keyframe_points.contains_key(number));
+            if let Some((number, pose)) = next {
+                is_encoding_points = true;
+                let source = hub.keyframe_source(&pose.camera, pose.stamp);
+                encodings.spawn_blocking(move || {
+                    let packed = source.and_then(|keyframe| pack_points(number, &keyframe));
+                    Encoded::Points(number, packed.map(Message::binary))
+                });
+            }
+        }
+        let wanted = wanted_images(&demands, live_images.borrow().keys());
+        // Sizes that no client wants any longer.
+        image_encodings.retain(|key, image_encoding| image_encoding.is_running || wanted.contains_key(key));
+        let is_unwanted = |key: &ImageKey| !wanted.contains_key(key);
+        if latest_messages_sender.borrow().live_images.keys().any(is_unwanted) {
+            latest_messages_sender.send_modify(|latest| latest.live_images.retain(|key, _| wanted.contains_key(key)));
+        }
+        for (key, period) in wanted {
+            let Some(image) = live_images.borrow().get(&key.0).cloned() else { continue };
+            let is_new = image_encodings.get(&key).is_none_or(|image_encoding| {
+                !image_encoding.is_running
+                    && image_encoding.at.elapsed() >= period
+                    && !Arc::ptr_eq(&image_encoding.image, &image)
             });
             if is_new {
-                let (camera, image) = (Arc::clone(camera), Arc::clone(image));
                 let entry = ImageEncoding { image: Arc::clone(&image), at: Instant::now(), is_running: true };
-                image_encodings.insert(Arc::clone(&camera), entry);
+                image_encodings.insert(key.clone(), entry);
                 encodings.spawn_blocking(move || {
-                    let message = live_message(&image, clock);
-                    Encoded::LiveImage(camera, message)
+                    let message = live_message(&image, key.1, clock);
+                    Encoded::LiveImage(key, message)
                 });
             }
         }
     }
 }
 
-fn live_message(image: &LiveImage, clock: ServerClock) -> Message {
-    match pack_live_image(image, clock) {
+/// The images that clients are subscribed to, with the shortest period of all clients.
+fn wanted_images<'a>(
+    demands: &[Demand],
+    cameras: impl Iterator<Item = &'a Arc<str>> + Clone,
+) -> BTreeMap<ImageKey, Duration> {
+    let mut wanted: BTreeMap<ImageKey, Duration> = BTreeMap::new();
+    for demand in demands {
+        for camera in cameras.clone() {
+            let subscription = demand.subscriptions.images_of(camera);
+            let Some(period) = subscription.period else { continue };
+            let shortest = wanted.entry((Arc::clone(camera), subscription.max_px)).or_insert(period);
+            *shortest = period.min(*shortest);
+        }
+    }
+    wanted
+}
+
+fn live_message(image: &LiveImage, max_px: [u32; 2], clock: ServerClock) -> Message {
+    match pack_live_image(image, fitted(image.size_px, max_px), clock) {
         Ok(bytes) => Message::binary(bytes),
         Err(error) => {
             let message = format!("live image of camera {:?}: {error}", image.camera);
-            text(&ServerMessage::Error { id: None, message: &message })
+            text(&ServerMessage::Error { id: None, view: None, message: &message })
         }
     }
 }
@@ -229,37 +289,5 @@ impl Throttle {
 
     fn reset(&mut self) {
         self.last = None;
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::{Item, LatestMessages, Received};
-    use axum::extract::ws::Message;
-
-    fn item(number: u64) -> Item {
-        Item { number, message: Message::text(number.to_string()) }
-    }
-
-    fn next(latest_messages: &LatestMessages, received: &mut Received, long: bool) -> Option<String> {
-        latest_messages.next(received, long).map(|message| message.into_text().expect("text").to_string())
-    }
-
-    #[test]
-    fn short_messages_first_then_cameras_round_robin() {
-        let mut latest_messages =
-            LatestMessages { scene: Some(item(1)), status: Some(item(4)), ..LatestMessages::default() };
-        latest_messages.keyframes = Some(item(2));
-        latest_messages.live_images = [("left".into(), item(3)), ("right".into(), item(5))].into();
-        let mut received = Received::default();
-        assert_eq!(next(&latest_messages, &mut received, false).as_deref(), Some("1"));
-        assert_eq!(next(&latest_messages, &mut received, false).as_deref(), Some("4"));
-        assert_eq!(next(&latest_messages, &mut received, false), None, "only long messages are left");
-        assert_eq!(next(&latest_messages, &mut received, true).as_deref(), Some("3"));
-        latest_messages.live_images.insert("left".into(), item(6));
-        assert_eq!(next(&latest_messages, &mut received, true).as_deref(), Some("5"), "the other camera comes next");
-        assert_eq!(next(&latest_messages, &mut received, true).as_deref(), Some("6"));
-        assert_eq!(next(&latest_messages, &mut received, true).as_deref(), Some("2"));
-        assert_eq!(next(&latest_messages, &mut received, true), None);
     }
 }

@@ -2,14 +2,18 @@
 
 use crate::picture::packing;
 use crate::pose::row_major;
-use crate::protocol::{PictureHeader, ProjectionMessage};
+use crate::protocol::ProjectionMessage;
 use crate::queue::{Outgoing, Queue, RenderJob};
+use crate::robot::{RobotDescription, RobotState};
+use crate::server_message::PictureHeader;
+use crate::subscriptions::Subscriptions;
 use crate::updates::{KeyframePose, LiveImage, RunResult, SceneHint, Status};
 use crate::view_request::ViewRequest;
-use kinematics::Transform;
+use keyframe::Keyframe;
+use kinematics::{Stamp, Transform};
 use parking_lot::{Condvar, Mutex, MutexGuard};
 use std::collections::BTreeMap;
-use std::sync::Arc;
+use std::sync::{Arc, Weak};
 use std::time::{Duration, Instant};
 use tokio::sync::{Notify, watch};
 use trainer::{Packing, Projection, RenderRequest, Rendered};
@@ -23,12 +27,30 @@ pub struct Hub {
 /// Latest images by camera name.
 pub(crate) type LiveImages = BTreeMap<Arc<str>, Arc<LiveImage>>;
 
+/// Keyframes by camera and stamp.
+type KeyframeSources = BTreeMap<(Arc<str>, i64), Weak<Keyframe>>;
+
+/// What a client receives.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Demand {
+    /// Its subscriptions.
+    pub(crate) subscriptions: Arc<Subscriptions>,
+    /// Whether it receives only the changes of the keyframe list.
+    pub(crate) has_keyframe_changes: bool,
+}
+
 #[derive(Debug, Default)]
 struct Shared {
     status: watch::Sender<Option<Arc<Status>>>,
     scene: watch::Sender<Option<Arc<SceneHint>>>,
     keyframes: watch::Sender<Arc<[KeyframePose]>>,
     live_images: watch::Sender<LiveImages>,
+    /// Keyframes whose points clients can draw. The run owns them and may drop them at any time.
+    keyframe_sources: Mutex<KeyframeSources>,
+    robot: watch::Sender<Option<Arc<RobotDescription>>>,
+    robot_state: watch::Sender<Option<Arc<RobotState>>>,
+    /// Requirements of the connected clients.
+    demands: Mutex<BTreeMap<u64, Demand>>,
     /// For each camera: transform `reported_from_corrected`.
     camera_corrections: Mutex<BTreeMap<Arc<str>, Transform>>,
     queue: Mutex<Queue>,
@@ -95,6 +117,33 @@ impl Hub {
         self.shared.keyframes.send_replace(keyframes.into());
     }
 
+    /// Sets the robot that clients draw.
+    pub fn set_robot(&self, robot: RobotDescription) {
+        self.shared.robot.send_replace(Some(Arc::new(robot)));
+    }
+
+    /// Sets the current state of the robot.
+    pub fn set_robot_state(&self, state: RobotState) {
+        self.shared.robot_state.send_replace(Some(Arc::new(state)));
+    }
+
+    /// Whether a client draws the robot.
+    pub fn needs_robot_state(&self) -> bool {
+        self.shared.demands.lock().values().any(|demand| demand.subscriptions.robot_state.is_some())
+    }
+
+    /// Sets the keyframes of which clients can draw points. They are not kept alive.
+    pub fn set_keyframe_sources<'a>(&self, keyframes: impl IntoIterator<Item = &'a Arc<Keyframe>>) {
+        let key = |keyframe: &Keyframe| (Arc::clone(&keyframe.camera), keyframe.stamp.0);
+        let sources = keyframes.into_iter().map(|keyframe| (key(keyframe), Arc::downgrade(keyframe))).collect();
+        *self.shared.keyframe_sources.lock() = sources;
+    }
+
+    /// The keyframe with this camera and stamp, if the run still has it.
+    pub(crate) fn keyframe_source(&self, camera: &Arc<str>, stamp: Stamp) -> Option<Arc<Keyframe>> {
+        self.shared.keyframe_sources.lock().get(&(Arc::clone(camera), stamp.0))?.upgrade()
+    }
+
     /// Number of connected clients.
     pub fn n_clients(&self) -> usize {
         self.queue().n_clients()
@@ -102,7 +151,7 @@ impl Hub {
 
     /// The next picture to render, if a client is waiting for one.
     ///
-    /// Each call returns one stage of one client; clients are served in turn.
+    /// Each call returns one stage of one view. Clients are served in turn, and so are the views of a client.
     pub fn next_request(&self) -> Option<PendingRender> {
         let job = self.queue().take()?;
         Some(PendingRender {
@@ -125,16 +174,31 @@ impl Hub {
     }
 
     pub(crate) fn join(&self) -> (u64, Arc<Notify>) {
-        self.queue().join()
+        let (client, wake) = self.queue().join();
+        self.set_demand(client, Demand::default());
+        (client, wake)
     }
 
     pub(crate) fn leave(&self, client: u64) {
         self.queue().leave(client);
+        self.shared.demands.lock().remove(&client);
     }
 
-    pub(crate) fn view_request(&self, client: u64, view_request: ViewRequest) {
-        self.queue().view_request(client, view_request);
+    /// Sets what a client receives.
+    pub(crate) fn set_demand(&self, client: u64, demand: Demand) {
+        self.shared.demands.lock().insert(client, demand);
+    }
+
+    /// What the connected clients receive.
+    pub(crate) fn demands(&self) -> Vec<Demand> {
+        self.shared.demands.lock().values().cloned().collect()
+    }
+
+    /// Adds a request. Returns false if the client has too many views.
+    pub(crate) fn view_request(&self, client: u64, view_request: ViewRequest) -> bool {
+        let is_added = self.queue().view_request(client, view_request);
         self.shared.work_arrived.notify_all();
+        is_added
     }
 
     pub(crate) fn collect(&self, client: u64) -> Option<Outgoing> {
@@ -156,6 +220,14 @@ impl Hub {
 
     pub(crate) fn keyframes(&self) -> watch::Receiver<Arc<[KeyframePose]>> {
         self.shared.keyframes.subscribe()
+    }
+
+    pub(crate) fn robot(&self) -> watch::Receiver<Option<Arc<RobotDescription>>> {
+        self.shared.robot.subscribe()
+    }
+
+    pub(crate) fn robot_state(&self) -> watch::Receiver<Option<Arc<RobotState>>> {
+        self.shared.robot_state.subscribe()
     }
 
     pub(crate) fn live_images(&self) -> watch::Receiver<LiveImages> {
@@ -219,7 +291,9 @@ impl PendingRender {
 
     /// Sends the client a one-sentence reason why this picture could not be rendered.
     pub fn fail(mut self, reason: &str) {
-        self.enqueue_answer(Outgoing::Failed { id: self.job.view_request.id, reason: reason.to_owned() });
+        let view_request = &self.job.view_request;
+        let (id, view) = (view_request.id, Arc::clone(&view_request.view));
+        self.enqueue_answer(Outgoing::Failed { id, view, reason: reason.to_owned() });
     }
 
     fn enqueue_answer(&mut self, outgoing: Outgoing) {
@@ -231,6 +305,7 @@ impl PendingRender {
         let view_request = &self.job.view_request;
         PictureHeader {
             id: view_request.id,
+            view: (!view_request.view.is_empty()).then(|| view_request.view.to_string()),
             stage: self.job.stage,
             n_stages: view_request.stages.len(),
             scale: view_request.stages[self.job.stage],

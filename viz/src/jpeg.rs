@@ -195,36 +195,64 @@ fn parts_of(file: &[u8]) -> Parts {
     }
 }
 
-/// Averages squares of `factor` x `factor` pixels. Columns and rows that do not fill a square are dropped.
-pub(crate) fn shrink(pixels: &Pixels<'_>, factor: u32) -> Result<([u32; 2], Vec<u8>), JpegError> {
+/// Downscales an image to RGB: each new pixel is the average of the area that it covers.
+pub(crate) fn downscale(pixels: &Pixels<'_>, size_px: [u32; 2]) -> Result<Vec<u8>, JpegError> {
     pixels.check()?;
     let n_channels = pixels.layout.n_channels();
-    let size_px = pixels.size_px.map(|n| n / factor);
-    let side = factor as usize;
-    let row_bytes = pixels.size_px[0] as usize * n_channels;
+    let row_bytes = (pixels.size_px[0] as usize * n_channels).max(1);
+    let columns = Spans::new(pixels.size_px[0], size_px[0]);
+    let rows = Spans::new(pixels.size_px[1], size_px[1]);
     let mut rgb = Vec::with_capacity(3 * size_px[0] as usize * size_px[1] as usize);
-    let mut sums = vec![[0_u32; 3]; size_px[0] as usize];
-    let area = factor * factor;
-    for rows in pixels.bytes.chunks_exact((row_bytes * side).max(1)) {
-        sums.fill([0; 3]);
-        for row in rows.chunks_exact(row_bytes) {
-            for (sum, square) in sums.iter_mut().zip(row.chunks_exact(side * n_channels)) {
-                for pixel in square.chunks_exact(n_channels) {
-                    sum[0] += u32::from(pixel[0]);
-                    sum[1] += u32::from(pixel[1]);
-                    sum[2] += u32::from(pixel[2]);
-                }
+    let mut row_sums = vec![0.0_f32; row_bytes];
+    for row in 0..size_px[1] {
+        row_sums.fill(0.0);
+        for (y, weight) in rows.of(row) {
+            for (sum, &value) in row_sums.iter_mut().zip(&pixels.bytes[y * row_bytes..][..row_bytes]) {
+                *sum += weight * f32::from(value);
             }
         }
-        let average = |sum: u32| u8::try_from((sum + area / 2) / area).unwrap_or(u8::MAX);
-        rgb.extend(sums.iter().flat_map(|sum| sum.map(average)));
+        for column in 0..size_px[0] {
+            let mut color = [0.0; 3];
+            for (x, weight) in columns.of(column) {
+                for (sum, value) in color.iter_mut().zip(&row_sums[x * n_channels..]) {
+                    *sum += weight * value;
+                }
+            }
+            #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "averages of bytes")]
+            rgb.extend(color.map(|value| (value + 0.5) as u8));
+        }
     }
-    Ok((size_px, rgb))
+    Ok(rgb)
+}
+
+/// The source pixels that each target pixel covers along one axis.
+struct Spans {
+    n_source: u32,
+    /// Source pixels per target pixel.
+    scale: f64,
+}
+
+impl Spans {
+    fn new(n_source: u32, n_target: u32) -> Self {
+        Self { n_source, scale: f64::from(n_source) / f64::from(n_target.max(1)) }
+    }
+
+    /// Index and weight of the source pixels of a target pixel. The weights add up to 1.
+    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "positions in the source image")]
+    fn of(&self, target: u32) -> impl Iterator<Item = (usize, f32)> + use<> {
+        let (begin, scale) = (f64::from(target) * self.scale, self.scale);
+        let end = (begin + scale).min(f64::from(self.n_source));
+        let last = (end.ceil() as u32).min(self.n_source);
+        ((begin.floor() as u32)..last).map(move |at| {
+            let covered = end.min(f64::from(at) + 1.0) - begin.max(f64::from(at));
+            (at as usize, (covered / scale) as f32)
+        })
+    }
 }
 
 #[cfg(test)]
 mod tests {
-    use super::{Chroma, Layout, Pixels, encode_in_strips, shrink};
+    use super::{Chroma, Layout, Pixels, downscale, encode_in_strips};
 
     /// Smooth colors with a few sharp edges, different in every corner.
     fn scene(width: u32, height: u32, layout: Layout) -> Vec<u8> {
@@ -292,13 +320,28 @@ mod tests {
     }
 
     #[test]
-    fn shrinking_averages_squares_and_crops_the_rest() {
+    fn downscaling_averages_the_covered_area() {
         let rgba: Vec<u8> = vec![
             10, 0, 0, 255, 20, 0, 0, 255, 99, 99, 99, 255, //
             30, 4, 0, 255, 40, 0, 8, 255, 99, 99, 99, 255,
         ];
         let pixels = Pixels { size_px: [3, 2], layout: Layout::Rgba, bytes: &rgba };
-        let (size_px, rgb) = shrink(&pixels, 2).expect("shrunk");
-        assert_eq!((size_px, rgb), ([1, 1], vec![25, 1, 2]));
+        // Columns of 1.5 pixels: (10 + 30 + (20 + 40) / 2) / 3 and ((20 + 40) / 2 + 2 * 99) / 3.
+        let rgb = downscale(&pixels, [2, 1]).expect("downscaled");
+        assert_eq!(rgb, [23, 1, 1, 76, 66, 67]);
+        assert_eq!(downscale(&pixels, [3, 2]).expect("unchanged")[3..6], [20, 0, 0]);
+        assert!(downscale(&Pixels { size_px: [4, 2], ..pixels }, [2, 1]).is_err());
+    }
+
+    #[test]
+    fn downscaling_keeps_the_mean() {
+        let bytes = scene(301, 203, Layout::Rgb);
+        let mean = |bytes: &[u8]| bytes.iter().map(|value| f64::from(*value)).sum::<f64>() / bytes.len() as f64;
+        for size_px in [[240, 161], [97, 65], [1, 1], [301, 1]] {
+            let pixels = Pixels { size_px: [301, 203], layout: Layout::Rgb, bytes: &bytes };
+            let small = downscale(&pixels, size_px).expect("downscaled");
+            assert_eq!(small.len(), 3 * (size_px[0] * size_px[1]) as usize);
+            assert!((mean(&small) - mean(&bytes)).abs() < 0.6, "{size_px:?}: {} {}", mean(&small), mean(&bytes));
+        }
     }
 }

@@ -14,22 +14,36 @@
 
 mod admission;
 mod broadcast;
+mod client_updates;
 mod clock;
+mod compact_depth;
 mod error;
 mod hub;
 mod jpeg;
+mod keyframe_log;
+mod keyframe_points;
+mod link_rate;
+#[cfg(test)]
+mod message_checks;
+mod negotiation;
 mod page;
 mod picture;
 mod pose;
 mod protocol;
 mod queue;
+mod robot;
 mod server;
+mod server_context;
+mod server_message;
 mod session;
+mod subscriptions;
 mod updates;
 mod view_request;
+mod writer;
 
 pub use error::Error;
 pub use hub::{Hub, PendingRender};
-pub use protocol::PROTOCOL_VERSION;
+pub use protocol::{BASE_PROTOCOL_VERSION, PROTOCOL_VERSION};
+pub use robot::{MeshFormat, RobotDescription, RobotMesh, RobotState};
 pub use server::{Server, ServerConfig};
 pub use updates::{KeyframePose, LiveImage, LivePixels, ModelStatus, RunResult, SceneHint, Status};

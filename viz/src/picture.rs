@@ -1,19 +1,21 @@
 //! Packs pictures and live images into binary messages.
 
 use crate::clock::ServerClock;
-use crate::jpeg::{Chroma, JpegError, Layout, Pixels, encode, n_threads, shrink};
-use crate::protocol::{BinaryHeader, ColorPart, DepthFormat, DepthPart, LiveHeader, PictureHeader, frame};
+use crate::compact_depth::compress;
+use crate::jpeg::{Chroma, JpegError, Layout, Pixels, downscale, encode, n_threads};
+use crate::protocol::DepthFormat;
+use crate::server_message::{BinaryHeader, ColorPart, DepthPart, LiveHeader, PictureHeader, frame};
 use crate::updates::{LiveImage, LivePixels};
 use crate::view_request::ViewRequest;
 use std::time::Instant;
 use trainer::{JPEG_QUALITY, PackedDepth, Packing, Picture, Rendered};
 
-/// JPEG quality of intermediate stages and live images, which are soon replaced.
+/// JPEG quality of intermediate stages, which are soon replaced.
 const QUALITY_INTERMEDIATE: u8 = 80;
+/// JPEG quality of live images. They are shown without enlargement, several times per second.
+const QUALITY_LIVE: u8 = 72;
 /// Smaller pictures keep full color resolution, because halving it saves little and the page enlarges these pictures.
 const MIN_HALVED_PX: usize = 256 * 256;
-/// Maximum width of live images as sent; the page displays them even smaller.
-const MAX_LIVE_WIDTH_PX: u32 = 640;
 /// Minimum depth pixels per thread; for smaller maps another thread does not help.
 const MIN_DEPTH_PX: usize = 128 * 1024;
 
@@ -26,6 +28,8 @@ pub(crate) enum PackError {
     Encode(#[from] JpegError),
     #[error("the JPEG file cannot be decoded: {0}")]
     Decode(#[from] image::ImageError),
+    #[error("the depth cannot be compressed: {0}")]
+    Depth(#[from] std::io::Error),
     #[error("the JPEG file has {got:?} pixels, expected {expected:?}")]
     SizeMismatch { got: [u32; 2], expected: [u32; 2] },
 }
@@ -54,15 +58,36 @@ pub(crate) fn pack_picture(
     };
     let offset = color.map_or(0, <[u8]>::len);
     header.color = color.map(|color| ColorPart { format: "jpeg", offset: 0, bytes: color.len() });
-    header.depth = depth.zip(view_request.depth).map(|(packed, format)| DepthPart {
-        format,
-        size_px: packed.size_px,
-        meters_per_count: packed.meters_per_count,
-        offset,
-        bytes: packed.counts.len(),
-    });
+    let compact;
+    let depth_bytes = match depth.zip(view_request.depth) {
+        None => &[][..],
+        Some((packed, format @ DepthFormat::CompactHalf)) => {
+            compact = compress(packed)?;
+            header.depth = Some(DepthPart {
+                format,
+                size_px: compact.size_px,
+                meters_per_count: None,
+                min_m: Some(compact.min_m),
+                log_step: Some(compact.log_step),
+                offset,
+                bytes: compact.bytes.len(),
+            });
+            &compact.bytes
+        }
+        Some((packed, format @ (DepthFormat::U16Half | DepthFormat::F32))) => {
+            header.depth = Some(DepthPart {
+                format,
+                size_px: packed.size_px,
+                meters_per_count: Some(packed.meters_per_count),
+                min_m: None,
+                log_step: None,
+                offset,
+                bytes: packed.counts.len(),
+            });
+            &packed.counts
+        }
+    };
     header.encode_millis = Some(began.elapsed().as_secs_f64() * 1e3);
-    let depth_bytes = depth.map_or(&[][..], |packed| &packed.counts);
     Ok(frame(&BinaryHeader::Picture(&header), &[color.unwrap_or_default(), depth_bytes]))
 }
 
@@ -88,13 +113,11 @@ fn pack_color(picture: &Picture, is_last: bool) -> Result<Vec<u8>, JpegError> {
     encode(&pixels, quality, if is_last || is_small { Chroma::Full } else { Chroma::Halved })
 }
 
-/// The binary message of a live image, shrunk to the maximum width.
-pub(crate) fn pack_live_image(image: &LiveImage, clock: ServerClock) -> Result<Vec<u8>, PackError> {
-    // A very flat image keeps one row.
-    let factor = image.size_px[0].div_ceil(MAX_LIVE_WIDTH_PX).min(image.size_px[1]).max(1);
+/// The binary message of a live image, downscaled to `size_px`.
+pub(crate) fn pack_live_image(image: &LiveImage, size_px: [u32; 2], clock: ServerClock) -> Result<Vec<u8>, PackError> {
     let decoded;
     let pixels = match &image.pixels {
-        LivePixels::Jpeg(file) if factor == 1 => return Ok(live_message(image, image.size_px, 1, file, clock)),
+        LivePixels::Jpeg(file) if size_px == image.size_px => return Ok(live_message(image, size_px, file, clock)),
         LivePixels::Jpeg(file) => {
             decoded = image::load_from_memory_with_format(file, image::ImageFormat::Jpeg)?.into_rgb8();
             let got = [decoded.width(), decoded.height()];
@@ -106,17 +129,17 @@ pub(crate) fn pack_live_image(image: &LiveImage, clock: ServerClock) -> Result<V
         LivePixels::Rgb(bytes) => Pixels { size_px: image.size_px, layout: Layout::Rgb, bytes },
         LivePixels::Rgba(bytes) => Pixels { size_px: image.size_px, layout: Layout::Rgba, bytes },
     };
-    if factor == 1 {
-        let jpeg = encode(&pixels, QUALITY_INTERMEDIATE, Chroma::Halved)?;
-        return Ok(live_message(image, image.size_px, 1, &jpeg, clock));
+    if size_px == image.size_px {
+        let jpeg = encode(&pixels, QUALITY_LIVE, Chroma::Halved)?;
+        return Ok(live_message(image, size_px, &jpeg, clock));
     }
-    let (size_px, rgb) = shrink(&pixels, factor)?;
-    let jpeg = encode(&Pixels { size_px, layout: Layout::Rgb, bytes: &rgb }, QUALITY_INTERMEDIATE, Chroma::Halved)?;
-    Ok(live_message(image, size_px, factor, &jpeg, clock))
+    let rgb = downscale(&pixels, size_px)?;
+    let jpeg = encode(&Pixels { size_px, layout: Layout::Rgb, bytes: &rgb }, QUALITY_LIVE, Chroma::Halved)?;
+    Ok(live_message(image, size_px, &jpeg, clock))
 }
 
-fn live_message(image: &LiveImage, size_px: [u32; 2], factor: u32, jpeg: &[u8], clock: ServerClock) -> Vec<u8> {
-    frame(&BinaryHeader::LiveImage(&LiveHeader::new(image, size_px, factor, clock)), &[jpeg])
+fn live_message(image: &LiveImage, size_px: [u32; 2], jpeg: &[u8], clock: ServerClock) -> Vec<u8> {
+    frame(&BinaryHeader::LiveImage(&LiveHeader::new(image, size_px, clock)), &[jpeg])
 }
 
 fn pack_depth(format: DepthFormat, picture: &Picture) -> Result<PackedDepth, PackError> {
@@ -128,7 +151,7 @@ fn pack_depth(format: DepthFormat, picture: &Picture) -> Result<PackedDepth, Pac
     }
     Ok(match format {
         DepthFormat::F32 => f32_depth(picture),
-        DepthFormat::U16Half => half_depth(picture, n_threads().min(needed / MIN_DEPTH_PX)),
+        DepthFormat::U16Half | DepthFormat::CompactHalf => half_depth(picture, n_threads().min(needed / MIN_DEPTH_PX)),
     })
 }
 
@@ -271,7 +294,7 @@ mod tests {
                 focal_px: [900.0, 902.0],
                 principal_px: [640.0, 360.0],
             };
-            let message = pack_live_image(&image, clock).expect("packed");
+            let message = pack_live_image(&image, [640, 360], clock).expect("packed");
             let n_header = u32::from_le_bytes([message[0], message[1], message[2], message[3]]) as usize;
             let header: serde_json::Value = serde_json::from_slice(&message[4..4 + n_header]).expect("JSON");
             assert_eq!(header["size_px"], serde_json::json!([640, 360]));

@@ -1,36 +1,79 @@
-//! The messages of `docs/reference/protocol.md` as serialized on the wire.
+//! The messages from clients, as in `docs/reference/protocol.md`.
 
-use crate::clock::ServerClock;
-use crate::pose::row_major;
-use crate::updates::{KeyframePose, LiveImage, SceneHint, Status};
 use serde::{Deserialize, Serialize};
 
-/// Protocol version. Clients with another version are disconnected.
-pub const PROTOCOL_VERSION: u32 = 3;
+/// Newest protocol version of the server.
+pub const PROTOCOL_VERSION: u32 = 4;
+
+/// Protocol version of a connection whose client has not negotiated another one. It is also the oldest version that
+/// the server supports.
+pub const BASE_PROTOCOL_VERSION: u32 = 3;
 
 /// Maximum length of a client's text message, bytes.
 pub(crate) const MAX_MESSAGE_BYTES: usize = 64 * 1024;
+
+/// Maximum rate that clients can subscribe to.
+pub(crate) const MAX_RATE_HZ: f64 = 100.0;
+
+/// Maximum number of keyframes in a `keyframe_changes` message.
+pub(crate) const MAX_CHANGED_KEYFRAMES: usize = 32;
 
 /// Messages from clients.
 #[derive(Debug, Deserialize)]
 #[serde(tag = "type", rename_all = "snake_case")]
 pub(crate) enum ClientMessage {
-    /// Protocol version of the client.
+    /// Protocol versions and capabilities of the client.
     Hello(ClientHello),
-    /// Requests a picture and replaces the client's previous request.
+    /// Requests a picture and replaces the previous request for the same view.
     Render(Box<RenderMessage>),
+    /// Sets how often a topic is sent, and at which size.
+    Subscribe(SubscribeMessage),
     /// Requests the server's time.
     Ping(ClientPing),
     /// The client disconnects.
     Goodbye(ClientGoodbye),
 }
 
-/// Fields of a client's `hello`.
+/// Fields of a client's `hello`. Unknown fields are ignored, because newer clients may send more.
+#[derive(Debug, Default, Deserialize)]
+pub(crate) struct ClientHello {
+    /// The only version of a client that supports no other.
+    pub(crate) protocol: Option<u32>,
+    /// Oldest and newest version of the client.
+    pub(crate) protocols: Option<[u32; 2]>,
+    /// Capabilities that the client wants to use.
+    #[serde(default)]
+    pub(crate) capabilities: Vec<String>,
+}
+
+/// Kinds of data that clients can subscribe to.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub(crate) enum Topic {
+    /// Status of the run.
+    Status,
+    /// Poses of the keyframes.
+    Keyframes,
+    /// Images of the cameras.
+    LiveImages,
+    /// Robot description and joint positions.
+    RobotState,
+    /// Points of each keyframe.
+    KeyframePoints,
+}
+
+/// Fields of `subscribe`.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(crate) struct ClientHello {
-    /// See [`PROTOCOL_VERSION`].
-    pub(crate) protocol: u32,
+pub(crate) struct SubscribeMessage {
+    /// What to send.
+    pub(crate) topic: Topic,
+    /// Maximum rate; 0 ends the subscription.
+    pub(crate) rate_hz: f64,
+    /// Only images of this camera; of all cameras without a subscription of their own if absent.
+    pub(crate) camera: Option<String>,
+    /// Maximum size of images.
+    pub(crate) size_px: Option<[u32; 2]>,
 }
 
 /// Fields of `ping`.
@@ -52,6 +95,8 @@ pub(crate) struct ClientGoodbye {}
 pub(crate) struct RenderMessage {
     /// Number chosen by the client and repeated in the pictures.
     pub(crate) id: u64,
+    /// Name of the view; requests for other views are independent.
+    pub(crate) view: Option<String>,
     /// Requested model; the first if absent.
     pub(crate) method: Option<String>,
     /// Row-major pose.
@@ -125,168 +170,8 @@ pub(crate) enum DepthFormat {
     /// 16-bit counts at half the picture's size; the nearest of each 2x2 pixels.
     #[default]
     U16Half,
+    /// Logarithmic counts at half the picture's size, compressed: see `compact_depth.rs`.
+    CompactHalf,
     /// 32-bit floats at the picture's size, unchanged from the model.
     F32,
-}
-
-/// JSON text messages from the server.
-#[derive(Debug, Serialize)]
-#[serde(tag = "type", rename_all = "snake_case")]
-pub(crate) enum ServerMessage<'a> {
-    /// First message of a connection.
-    Hello {
-        protocol: u32,
-        server: &'a str,
-        client: u64,
-        max_size_px: [u32; 2],
-        default_stages: &'a [f64],
-        clock_millis: f64,
-    },
-    /// Status of the run.
-    Status(&'a Status),
-    /// Scene extent and initial view.
-    Scene { center_m: [f64; 3], radius_m: f64, world_from_camera: [f64; 16] },
-    /// Poses of all stored keyframes.
-    Keyframes { keyframes: Vec<KeyframeMessage<'a>> },
-    /// Reason why a message was invalid or a picture failed.
-    Error { id: Option<u64>, message: &'a str },
-    /// Sent at a fixed rate, so that silence indicates a broken connection.
-    Heartbeat { clock_millis: f64 },
-    /// Reply to a client's `ping`.
-    Pong { t: f64, clock_millis: f64 },
-    /// Ends the connection.
-    Goodbye { reason: &'a str },
-}
-
-/// One keyframe of `keyframes`.
-#[derive(Debug, Serialize)]
-pub(crate) struct KeyframeMessage<'a> {
-    camera: &'a str,
-    world_from_camera: [f64; 16],
-    size_px: [u32; 2],
-    focal_px: [f64; 2],
-    principal_px: [f64; 2],
-}
-
-impl<'a> From<&'a KeyframePose> for KeyframeMessage<'a> {
-    fn from(keyframe: &'a KeyframePose) -> Self {
-        Self {
-            camera: &keyframe.camera,
-            world_from_camera: row_major(&keyframe.world_from_camera),
-            size_px: keyframe.size_px,
-            focal_px: keyframe.focal_px,
-            principal_px: keyframe.principal_px,
-        }
-    }
-}
-
-impl From<&SceneHint> for ServerMessage<'_> {
-    fn from(hint: &SceneHint) -> Self {
-        Self::Scene {
-            center_m: hint.center_m,
-            radius_m: hint.radius_m,
-            world_from_camera: row_major(&hint.world_from_camera),
-        }
-    }
-}
-
-/// Header of a binary message.
-#[derive(Debug, Serialize)]
-#[serde(tag = "type", rename_all = "snake_case")]
-pub(crate) enum BinaryHeader<'a> {
-    /// A rendered picture.
-    Picture(&'a PictureHeader),
-    /// The current image of a camera.
-    LiveImage(&'a LiveHeader<'a>),
-}
-
-/// Header of `picture`.
-#[derive(Debug, Serialize)]
-pub(crate) struct PictureHeader {
-    pub(crate) id: u64,
-    pub(crate) stage: usize,
-    pub(crate) n_stages: usize,
-    pub(crate) scale: f64,
-    pub(crate) last: bool,
-    pub(crate) size_px: [u32; 2],
-    pub(crate) full_size_px: [u32; 2],
-    pub(crate) world_from_camera: [f64; 16],
-    pub(crate) projection: ProjectionMessage,
-    pub(crate) near_m: f64,
-    pub(crate) far_m: f64,
-    pub(crate) waited_millis: f64,
-    pub(crate) render_millis: f64,
-    pub(crate) encode_millis: Option<f64>,
-    pub(crate) keyframes: Option<u64>,
-    pub(crate) color: Option<ColorPart>,
-    pub(crate) depth: Option<DepthPart>,
-}
-
-/// Position of the color in the payload.
-#[derive(Debug, Serialize)]
-pub(crate) struct ColorPart {
-    pub(crate) format: &'static str,
-    pub(crate) offset: usize,
-    pub(crate) bytes: usize,
-}
-
-/// Position of the depth in the payload, and its encoding.
-#[derive(Debug, Serialize)]
-pub(crate) struct DepthPart {
-    pub(crate) format: DepthFormat,
-    pub(crate) size_px: [u32; 2],
-    pub(crate) meters_per_count: f64,
-    pub(crate) offset: usize,
-    pub(crate) bytes: usize,
-}
-
-/// Header of `live_image`.
-#[derive(Debug, Serialize)]
-pub(crate) struct LiveHeader<'a> {
-    camera: &'a str,
-    stamp_nanos: i64,
-    captured_millis: f64,
-    size_px: [u32; 2],
-    format: &'static str,
-    world_from_camera: Option<[f64; 16]>,
-    focal_px: [f64; 2],
-    principal_px: [f64; 2],
-}
-
-impl<'a> LiveHeader<'a> {
-    /// The header of an image sent at `size_px`, after dividing its sides by `factor`.
-    pub(crate) fn new(image: &'a LiveImage, size_px: [u32; 2], factor: u32, clock: ServerClock) -> Self {
-        let scaled_down = |value: f64| value / f64::from(factor);
-        Self {
-            camera: &image.camera,
-            stamp_nanos: image.stamp.0,
-            captured_millis: clock.millis(image.captured_at),
-            size_px,
-            format: "jpeg",
-            world_from_camera: image.world_from_camera.as_ref().map(row_major),
-            focal_px: image.focal_px.map(scaled_down),
-            principal_px: image.principal_px.map(scaled_down),
-        }
-    }
-}
-
-impl ServerMessage<'_> {
-    /// The message as JSON.
-    pub(crate) fn to_json(&self) -> String {
-        serde_json::to_string(self).expect("these types hold only strings, numbers and maps with string keys")
-    }
-}
-
-/// A binary message: header length as little-endian u32, JSON header, payload.
-pub(crate) fn frame(header: &BinaryHeader<'_>, payload: &[&[u8]]) -> Vec<u8> {
-    let header = serde_json::to_vec(header).expect("these types hold only strings and numbers");
-    let n_header = u32::try_from(header.len()).expect("a header has some hundred bytes");
-    let n_payload: usize = payload.iter().map(|part| part.len()).sum();
-    let mut bytes = Vec::with_capacity(4 + header.len() + n_payload);
-    bytes.extend_from_slice(&n_header.to_le_bytes());
-    bytes.extend_from_slice(&header);
-    for part in payload {
-        bytes.extend_from_slice(part);
-    }
-    bytes
 }

@@ -1,14 +1,19 @@
-//! Render requests by client: the newest request of each client, stage by stage, clients in turn.
+//! Render requests by client and view: the newest request of each view, stage by stage. Clients take turns, and so do
+//! the views of a client.
 
-use crate::protocol::PictureHeader;
+use crate::server_message::PictureHeader;
 use crate::view_request::ViewRequest;
 use std::collections::{BTreeMap, VecDeque};
+use std::ops::Bound;
 use std::sync::Arc;
 use tokio::sync::Notify;
 use trainer::Rendered;
 
 /// Maximum number of pictures per client that are being rendered or sent. It limits rendering for slow clients.
 const MAX_UNSENT: usize = 2;
+
+/// Maximum number of views per client.
+pub(crate) const MAX_VIEWS: usize = 8;
 
 /// If the full picture is expected to take less time than this, coarser stages are skipped.
 const FAST_MILLIS: f64 = 30.0;
@@ -24,15 +29,22 @@ pub(crate) struct Queue {
 /// Pending work of one client.
 #[derive(Debug, Default)]
 struct ClientQueue {
-    view_request: Option<Arc<ViewRequest>>,
-    next_stage: usize,
+    views: BTreeMap<Arc<str>, ViewQueue>,
+    last_served: Arc<str>,
     n_unsent: usize,
     outbox: VecDeque<Outgoing>,
     wake: Arc<Notify>,
+}
+
+/// Pending work of one view.
+#[derive(Debug, Default)]
+struct ViewQueue {
+    view_request: Option<Arc<ViewRequest>>,
+    next_stage: usize,
     last_full: Option<FullPicture>,
 }
 
-/// Render time of the last stage of a client's last request.
+/// Render time of the last stage of a view's last request.
 #[derive(Debug)]
 struct FullPicture {
     method: Option<String>,
@@ -57,7 +69,7 @@ pub(crate) enum Outgoing {
     /// A rendered stage that is not encoded yet. The header does not yet describe the parts of the payload.
     Picture(Box<(RenderJob, PictureHeader, Rendered)>),
     /// A stage that could not be rendered.
-    Failed { id: u64, reason: String },
+    Failed { id: u64, view: Arc<str>, reason: String },
 }
 
 impl Queue {
@@ -80,17 +92,24 @@ impl Queue {
         self.clients.len()
     }
 
-    /// Adds a request. Stages of the client's older request that have not been started are dropped.
+    /// Adds a request. Stages of the older request for the same view that have not been started are dropped. Returns
+    /// false if all of the client's views have pending requests, so that there is no room for another view.
     ///
     /// Only the last stage is kept if it is expected to be fast.
-    pub(crate) fn view_request(&mut self, client: u64, mut view_request: ViewRequest) {
-        if let Some(waiting) = self.clients.get_mut(&client) {
-            if waiting.last_full.as_ref().is_some_and(|last| last.expected_millis(&view_request) < FAST_MILLIS) {
-                view_request.stages.drain(..view_request.stages.len() - 1);
-            }
-            waiting.view_request = Some(Arc::new(view_request));
-            waiting.next_stage = 0;
+    pub(crate) fn view_request(&mut self, client: u64, mut view_request: ViewRequest) -> bool {
+        let Some(waiting) = self.clients.get_mut(&client) else { return true };
+        if !waiting.views.contains_key(&view_request.view) && waiting.views.len() >= MAX_VIEWS {
+            let idle = waiting.views.iter().find(|(_, view)| view.view_request.is_none());
+            let Some(name) = idle.map(|(name, _)| Arc::clone(name)) else { return false };
+            waiting.views.remove(&name);
         }
+        let view = waiting.views.entry(Arc::clone(&view_request.view)).or_default();
+        if view.last_full.as_ref().is_some_and(|last| last.expected_millis(&view_request) < FAST_MILLIS) {
+            view_request.stages.drain(..view_request.stages.len() - 1);
+        }
+        view.view_request = Some(Arc::new(view_request));
+        view.next_stage = 0;
+        true
     }
 
     /// Whether [`take`](Self::take) would return a stage.
@@ -98,7 +117,7 @@ impl Queue {
         self.clients.values().any(ClientQueue::is_ready)
     }
 
-    /// The next stage to render: clients in turn, each client's stages in order.
+    /// The next stage to render: clients in turn, the views of a client in turn, and the stages of a view in order.
     pub(crate) fn take(&mut self) -> Option<RenderJob> {
         let after = self.clients.range(self.last_served + 1..).find(|(_, waiting)| waiting.is_ready());
         let (&client, _) = after.or_else(|| self.clients.iter().find(|(_, waiting)| waiting.is_ready()))?;
@@ -108,9 +127,10 @@ impl Queue {
 
     /// Records the render time of the last stage of a request.
     pub(crate) fn record_render_time(&mut self, job: &RenderJob, millis: f64) {
-        if let Some(waiting) = self.clients.get_mut(&job.client) {
+        let view = self.clients.get_mut(&job.client).and_then(|waiting| waiting.views.get_mut(&job.view_request.view));
+        if let Some(view) = view {
             let (method, n_px) = (job.view_request.method.clone(), n_px_of_last_stage(&job.view_request));
-            waiting.last_full = Some(FullPicture { method, n_px, millis });
+            view.last_full = Some(FullPicture { method, n_px, millis });
         }
     }
 
@@ -137,17 +157,23 @@ impl Queue {
 
 impl ClientQueue {
     fn is_ready(&self) -> bool {
-        self.view_request.is_some() && self.n_unsent < MAX_UNSENT
+        self.n_unsent < MAX_UNSENT && self.views.values().any(|view| view.view_request.is_some())
     }
 
     fn take(&mut self, client: u64) -> Option<RenderJob> {
-        let view_request = self.view_request.clone()?;
-        let stage = self.next_stage;
-        self.next_stage += 1;
-        self.n_unsent += 1;
-        if self.next_stage == view_request.stages.len() {
-            self.view_request = None;
+        let after = (Bound::Excluded(Arc::clone(&self.last_served)), Bound::Unbounded);
+        let is_pending = |(_, view): &(&Arc<str>, &ViewQueue)| view.view_request.is_some();
+        let next = self.views.range::<Arc<str>, _>(after).find(is_pending);
+        let name = Arc::clone(next.or_else(|| self.views.iter().find(is_pending))?.0);
+        let view = self.views.get_mut(&name)?;
+        let view_request = view.view_request.clone()?;
+        let stage = view.next_stage;
+        view.next_stage += 1;
+        if view.next_stage == view_request.stages.len() {
+            view.view_request = None;
         }
+        self.last_served = name;
+        self.n_unsent += 1;
         Some(RenderJob { client, view_request, stage })
     }
 }

@@ -5,9 +5,10 @@ use crate::broadcast::broadcast;
 use crate::clock::ServerClock;
 use crate::page::FILES;
 use crate::protocol::MAX_MESSAGE_BYTES;
-use crate::session::{self, ServerContext};
+use crate::server_context::ServerContext;
+use crate::session;
 use crate::{Error, Hub, Status};
-use axum::extract::{Extension, Request, State, WebSocketUpgrade};
+use axum::extract::{Extension, Path, Request, State, WebSocketUpgrade};
 use axum::http::{HeaderMap, HeaderName, HeaderValue, StatusCode, header};
 use axum::middleware::{Next, from_fn};
 use axum::response::{IntoResponse, Response};
@@ -230,7 +231,8 @@ struct AppState {
 }
 
 fn router(app_state: AppState) -> Router {
-    let mut router = Router::new().route("/status", get(status)).route("/ws", get(connect));
+    let mut router =
+        Router::new().route("/status", get(status)).route("/robot/{mesh}", get(robot_mesh)).route("/ws", get(connect));
     for file in FILES {
         router = router.route(file.path, get(move |headers: HeaderMap| async move { file.response(&headers) }));
     }
@@ -249,6 +251,18 @@ async fn status(State(app_state): State<AppState>) -> Response {
             (headers, json).into_response()
         }
         Err(error) => (StatusCode::INTERNAL_SERVER_ERROR, error.to_string()).into_response(),
+    }
+}
+
+/// A mesh file of the robot. Names are numbers in a list, so that no other file can be requested.
+async fn robot_mesh(Path(name): Path<String>, State(app_state): State<AppState>) -> Response {
+    let robot = app_state.server_context.hub.robot().borrow().clone();
+    match robot.as_deref().and_then(|robot| robot.mesh_at(&name)) {
+        Some(mesh) => {
+            let headers = [(header::CONTENT_TYPE, mesh.format.content_type()), (header::CACHE_CONTROL, "no-store")];
+            (headers, Body::from(axum::body::Bytes::from_owner(Arc::clone(&mesh.bytes)))).into_response()
+        }
+        None => (StatusCode::NOT_FOUND, "the robot has no mesh with this name").into_response(),
     }
 }
 

@@ -95,6 +95,8 @@ pub struct SceneHint {
 pub struct KeyframePose {
     /// Name of the camera.
     pub camera: Arc<str>,
+    /// Stamp of the keyframe; with the camera, it identifies the keyframe.
+    pub stamp: Stamp,
     /// Pose at the keyframe's stamp.
     pub world_from_camera: Transform,
     /// Width and height, pixels.

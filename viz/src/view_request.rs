@@ -3,6 +3,7 @@
 use crate::pose::from_row_major;
 use crate::protocol::{CropMessage, DepthFormat, Output, ProjectionMessage, RenderMessage};
 use kinematics::Transform;
+use std::sync::Arc;
 use std::time::Instant;
 use trainer::{Aabb, Projection, RenderRequest};
 
@@ -16,6 +17,9 @@ pub(crate) const DEFAULT_STAGES: [f64; 3] = [0.1, 0.5, 1.0];
 const DEFAULT_NEAR_M: f64 = 0.01;
 /// Default far limit, meters.
 const DEFAULT_FAR_M: f64 = 100.0;
+
+/// Maximum length of the name of a view, bytes.
+const MAX_VIEW_BYTES: usize = 64;
 
 /// The reason why a message is invalid, which is sent to the client.
 #[derive(Debug, thiserror::Error)]
@@ -42,6 +46,18 @@ pub(crate) enum InvalidRequest {
     NoOutput,
     #[error("background_srgb must be three numbers from 0 to 1")]
     Background,
+    #[error("the name of the view has {got} bytes, expected at most {MAX_VIEW_BYTES}")]
+    ViewName { got: usize },
+    #[error("{max} views have pending requests, which is the maximum; wait for a picture of one of them")]
+    Views { max: usize },
+    #[error("rate_hz is {got}, expected 0 to {max}", max = crate::protocol::MAX_RATE_HZ)]
+    Rate { got: f64 },
+    #[error("camera and size_px apply only to the topic live_images")]
+    NotImages,
+    #[error("size_px is {got:?}, each side must be at least {min}")]
+    ImageSize { got: [u32; 2], min: u32 },
+    #[error("at most {max} cameras can have a subscription of their own, with names of at most {max_bytes} bytes")]
+    Cameras { max: usize, max_bytes: usize },
 }
 
 /// A validated render message.
@@ -49,6 +65,8 @@ pub(crate) enum InvalidRequest {
 pub(crate) struct ViewRequest {
     /// Number chosen by the client.
     pub(crate) id: u64,
+    /// Name of the view; empty by default.
+    pub(crate) view: Arc<str>,
     /// When it was received.
     pub(crate) received: Instant,
     /// Requested model; the first if `None`.
@@ -75,6 +93,7 @@ impl ViewRequest {
             checked_range(message.near_m.unwrap_or(DEFAULT_NEAR_M), message.far_m.unwrap_or(DEFAULT_FAR_M))?;
         Ok(Self {
             id: message.id,
+            view: checked_view(message.view.as_deref().unwrap_or_default())?,
             received: Instant::now(),
             method: message.method.clone(),
             request: RenderRequest {
@@ -119,6 +138,10 @@ fn scaled(n: u32, scale: f64) -> u32 {
 
 fn rigid(rows: &[f64; 16], field: &'static str) -> Result<Transform, InvalidRequest> {
     from_row_major(rows).ok_or(InvalidRequest::NotRigid { field })
+}
+
+fn checked_view(name: &str) -> Result<Arc<str>, InvalidRequest> {
+    if name.len() <= MAX_VIEW_BYTES { Ok(name.into()) } else { Err(InvalidRequest::ViewName { got: name.len() }) }
 }
 
 fn checked_size(size_px: [u32; 2]) -> Result<[u32; 2], InvalidRequest> {
@@ -223,7 +246,8 @@ mod tests {
 
     #[test]
     fn errors_name_the_invalid_field() {
-        let cases: [(&str, Value, &str); 12] = [
+        let cases: [(&str, Value, &str); 13] = [
+            ("view", json!("v".repeat(65)), "view has 65 bytes"),
             ("world_from_camera", json!([2, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]), "world_from_camera"),
             ("world_from_camera", json!([1, 2, 3]), "length"),
             ("size_px", json!([0, 720]), "size_px"),

@@ -102,6 +102,7 @@ fn side_camera() -> KeyframePose {
     let rotation = UnitQuaternion::face_towards(&(Point3::new(0.0, 0.2, 0.1) - eye), &-Vector3::z());
     KeyframePose {
         camera: "wrist".into(),
+        stamp: Stamp(0),
         world_from_camera: Transform::from_parts(eye.into(), rotation),
         size_px: [640, 480],
         focal_px: [560.0, 560.0],

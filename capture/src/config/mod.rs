@@ -105,6 +105,15 @@ impl Rig {
         Ok(rig)
     }
 
+    /// The folder of the robot description that a rig file names; `None` if it names none or cannot be read. Mesh files
+    /// are named relative to this folder.
+    #[must_use]
+    pub fn urdf_folder(path: &Path) -> Option<PathBuf> {
+        let table: toml::Table = toml::from_str(&std::fs::read_to_string(path).ok()?).ok()?;
+        let urdf = path.parent().unwrap_or(Path::new("")).join(table.get("arm")?.get("urdf")?.as_str()?);
+        std::path::absolute(urdf).ok()?.parent().map(Path::to_owned)
+    }
+
     /// Checks the text of a rig file and the robot description `urdf_text`; `file` is the name used in messages.
     ///
     /// # Errors

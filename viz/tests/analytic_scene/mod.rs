@@ -37,8 +37,7 @@ pub(crate) fn draw(request: &RenderRequest) -> Picture {
     let (mut rgba_srgb, mut depth_m) = (Vec::new(), Vec::new());
     for y in 0..height {
         for x in 0..width {
-            let ray = ray_in_camera(request, f64::from(x) + 0.5, f64::from(y) + 0.5);
-            let direction = request.world_from_camera.rotation * ray;
+            let (_, direction) = ray_in_world(request, f64::from(x) + 0.5, f64::from(y) + 0.5);
             let hit = nearest_hit(request, eye, direction);
             let color = hit.map_or(request.background_srgb.map(f64::from), |hit| hit.1);
             rgba_srgb.extend(color.map(|value| (value.clamp(0.0, 1.0) * 255.0).round() as u8));
@@ -47,6 +46,12 @@ pub(crate) fn draw(request: &RenderRequest) -> Picture {
         }
     }
     Picture { size_px: request.size_px, rgba_srgb, depth_m }
+}
+
+/// Eye and direction of a pixel in world; hits of the direction are depths.
+pub(crate) fn ray_in_world(request: &RenderRequest, u: f64, v: f64) -> (Point3<f64>, Vector3<f64>) {
+    let eye = Point3::from(request.world_from_camera.translation.vector);
+    (eye, request.world_from_camera.rotation * ray_in_camera(request, u, v))
 }
 
 /// Direction of a pixel; its length is 1 along z (pinhole) or 1 (equirectangular), so that hits are depths.

@@ -8,6 +8,10 @@ use tungstenite::{Message, WebSocket};
 /// A connection to the server under test.
 pub(crate) struct Client {
     socket: WebSocket<TcpStream>,
+    /// The parts of a binary message received so far.
+    joined: Vec<u8>,
+    /// Bytes of all messages received so far.
+    n_received: usize,
 }
 
 /// One message from the server.
@@ -23,10 +27,19 @@ pub(crate) enum Received {
 
 impl Client {
     pub(crate) fn connect(address: SocketAddr) -> Self {
-        let stream = TcpStream::connect(address).expect("the server listens");
+        Self::over(TcpStream::connect(address).expect("the server listens"), address)
+    }
+
+    /// A client that uses this connection.
+    pub(crate) fn over(stream: TcpStream, address: SocketAddr) -> Self {
         stream.set_read_timeout(Some(super::TIMEOUT)).expect("a timeout");
         let (socket, _) = tungstenite::client(format!("ws://{address}/ws"), stream).expect("a WebSocket");
-        Self { socket }
+        Self { socket, joined: Vec::new(), n_received: 0 }
+    }
+
+    /// Bytes of all messages received so far, without WebSocket headers.
+    pub(crate) fn n_received(&self) -> usize {
+        self.n_received
     }
 
     pub(crate) fn send_json(&mut self, message: &Value) {
@@ -46,8 +59,23 @@ impl Client {
     pub(crate) fn receive(&mut self) -> Received {
         loop {
             match self.socket.read() {
-                Ok(Message::Text(text)) => return Received::Text(serde_json::from_str(&text).expect("JSON")),
-                Ok(Message::Binary(bytes)) => return unframe(&bytes),
+                Ok(Message::Text(text)) => {
+                    self.n_received += text.len();
+                    return Received::Text(serde_json::from_str(&text).expect("JSON"));
+                }
+                Ok(Message::Binary(bytes)) => {
+                    self.n_received += bytes.len();
+                    match unframe(&bytes) {
+                        Received::Binary(header, part) if header["type"] == "part" => {
+                            assert_eq!(header["offset"].as_u64(), u64::try_from(self.joined.len()).ok(), "in order");
+                            self.joined.extend(part);
+                            if header["bytes"].as_u64() == u64::try_from(self.joined.len()).ok() {
+                                return unframe(&std::mem::take(&mut self.joined));
+                            }
+                        }
+                        whole => return whole,
+                    }
+                }
                 Ok(Message::Close(_)) => {}
                 Ok(_) => {}
                 Err(tungstenite::Error::ConnectionClosed | tungstenite::Error::Protocol(_)) => return Received::End,

@@ -1,6 +1,8 @@
 // The WebSocket: opens it, detects silence, reconnects after a failure, and forwards messages.
 
-import { type BinaryHeader, type ClientMessage, PROTOCOL_VERSION, type TextMessage, unframe } from "./protocol";
+import { agree } from "./negotiation";
+import { PartJoiner } from "./part_joiner";
+import { type BinaryHeader, type Capability, type ClientMessage, type TextMessage, unframe } from "./protocol";
 import { ServerClock } from "./server_clock";
 
 const CHECK_MILLIS = 100;
@@ -28,6 +30,12 @@ export interface ConnectionEvents {
 
 export class Connection {
   readonly clock = new ServerClock();
+  /** Bytes received since the page was opened. */
+  nReceived = 0;
+  /** Time from the last ping to its answer; null before the first. */
+  roundTripMillis: number | null = null;
+  private readonly parts = new PartJoiner();
+  private capabilities: ReadonlySet<string> = new Set();
   private socket: WebSocket | null = null;
   private goodbye = "";
   private state: ConnectionState = "connecting";
@@ -52,6 +60,11 @@ export class Connection {
     return this.socket?.readyState === WebSocket.OPEN && (this.state === "open" || this.state === "silent");
   }
 
+  /** Whether the server has a capability that the page can use. */
+  supports(capability: Capability): boolean {
+    return this.capabilities.has(capability);
+  }
+
   send(message: ClientMessage): void {
     if (this.socket?.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify(message));
   }
@@ -68,6 +81,8 @@ export class Connection {
       if (socket === this.socket) this.disconnect();
     };
     this.socket = socket;
+    this.parts.forget();
+    this.capabilities = new Set();
     this.receivedAt = performance.now();
     this.clock.forget();
   }
@@ -135,34 +150,49 @@ export class Connection {
       this.state = "open";
       this.report();
     }
+    this.nReceived += typeof data === "string" ? data.length : data.byteLength;
     if (typeof data !== "string") {
-      const { header, payload } = unframe(data);
-      this.events.binary(header, payload);
+      this.receiveBinary(data);
       return;
     }
     const message = JSON.parse(data) as TextMessage;
     switch (message.type) {
-      case "hello":
+      case "hello": {
         this.goodbye = "";
-        if (message.protocol !== PROTOCOL_VERSION) {
-          this.goodbye = "this page and the server have different versions, reload the page";
+        const agreement = agree(message);
+        if (typeof agreement === "string") {
+          this.goodbye = agreement;
           this.disconnect();
           return;
         }
+        this.capabilities = agreement.capabilities;
+        if (agreement.hello) this.send(agreement.hello);
         this.nRetries = 0;
         this.state = "open";
         this.report();
         break;
+      }
       case "heartbeat":
         this.clock.observeMessage(message.clock_millis);
         break;
       case "pong":
         this.clock.observePong(message.t, message.clock_millis);
+        this.roundTripMillis = performance.now() - message.t;
         break;
       case "goodbye":
         this.goodbye = message.reason;
         break;
     }
     this.events.text(message);
+  }
+
+  private receiveBinary(data: ArrayBuffer): void {
+    const { header, payload } = unframe(data);
+    if (header.type !== "part") {
+      this.events.binary(header, payload);
+      return;
+    }
+    const joined = this.parts.add(header, payload);
+    if (joined) this.receiveBinary(joined);
   }
 }

@@ -3,12 +3,17 @@
 import { Banner } from "./banner";
 import { Connection } from "./connection";
 import { element } from "./element";
+import { setUpHelp } from "./help";
+import { KeyframeList } from "./keyframe_list";
+import { LinkReadout } from "./link_readout";
 import { LiveImages } from "./live_images";
 import { ModelSwitch } from "./model_switch";
 import { BACKGROUND, OrbitView } from "./orbit_view";
 import type { BinaryHeader, LiveImageHeader, PictureHeader, Status, TextMessage } from "./protocol";
 import { Readouts } from "./readouts";
 import { RenderScheduler } from "./render_scheduler";
+import { RobotAge } from "./robot_age";
+import { Subscriptions } from "./subscriptions";
 
 let stages = [0.1, 0.5, 1];
 let latestStatus: Status | null = null;
@@ -32,7 +37,11 @@ const connection = new Connection(`ws://${location.host}/ws`, {
     if (state === "open" && !wasOpen) {
       view.picture.forget();
       liveImages.forget();
+      robotAge.forget();
       scheduler.restart();
+      view.points.clear();
+      subscriptions.restart();
+      element("toggle-points").hidden = !connection.supports("keyframe_points");
     }
     if (shown.dataset.state !== before) view.changed();
   },
@@ -40,6 +49,10 @@ const connection = new Connection(`ws://${location.host}/ws`, {
   binary: receiveBinary,
 });
 const liveImages = new LiveImages(() => connection.clock);
+const robotAge = new RobotAge(view.robot, connection.clock);
+const subscriptions = new Subscriptions(connection);
+const keyframes = new KeyframeList();
+new LinkReadout(connection);
 const models = new ModelSwitch(() => {
   scheduler.restart();
   if (latestStatus) showStatus(latestStatus);
@@ -64,10 +77,27 @@ function receiveText(message: TextMessage): void {
       view.overlays.setKeyframes(message.keyframes);
       view.changed();
       break;
+    case "keyframe_changes":
+      keyframes.apply(message);
+      view.points.setKeyframes(keyframes.keyframes);
+      view.overlays.setKeyframes(keyframes.keyframes);
+      view.changed();
+      break;
+    case "robot":
+      view.robot.setRobot(message);
+      element("toggle-robot").hidden = false;
+      element("toggle-follow").hidden = false;
+      break;
+    case "robot_state":
+      view.robot.setState(message);
+      robotAge.received(message);
+      view.follow();
+      break;
     case "error":
       scheduler.failed(message.id);
       element("notice").textContent = message.message;
       break;
+    case "welcome":
     case "heartbeat":
     case "pong":
     case "goodbye":
@@ -85,6 +115,9 @@ function showStatus(status: Status): void {
 function receiveBinary(header: BinaryHeader, payload: Uint8Array<ArrayBuffer>): void {
   if (header.type === "picture") {
     void showPicture(header, payload);
+  } else if (header.type === "keyframe_points") {
+    view.points.add(header, payload);
+    view.changed();
   } else {
     liveImages.show(header, payload);
     if (header.world_from_camera) {
@@ -129,13 +162,29 @@ function action(id: string, key: string, act: () => void): void {
 }
 
 action("reset-view", "r", () => view.reset());
+action("full-screen", "u", () => {
+  if (document.fullscreenElement) void document.exitFullscreen();
+  else void document.documentElement.requestFullscreen();
+});
+setUpHelp();
+action("look-top", "t", () => view.lookAlong("top"));
+action("look-front", "f", () => view.lookAlong("front"));
+action("look-nearest", "n", () => view.lookFromNearest(keyframes.keyframes));
 action("look-live", "c", () => {
   if (liveCamera?.world_from_camera) view.lookFrom(liveCamera.world_from_camera);
 });
 element("look-live", HTMLButtonElement).disabled = true;
+toggle("toggle-model", "m", (isOn) => (view.picture.enabled = isOn));
 toggle("toggle-grid", "g", (isOn) => (view.overlays.showsGround = isOn));
 toggle("toggle-keyframes", "k", (isOn) => (view.overlays.showsKeyframes = isOn));
-toggle("toggle-occlude", "o", (isOn) => (view.picture.occludes = isOn));
+toggle("toggle-crop", "x", (isOn) => (view.crop.enabled = isOn));
+toggle("toggle-follow", "l", (isOn) => (view.follows = isOn));
+toggle("toggle-points", "p", (isOn) => {
+  subscriptions.points = isOn;
+  if (!isOn) view.points.clear();
+});
+toggle("toggle-robot", "b", (isOn) => (view.robot.enabled = isOn));
+toggle("toggle-occlude", "o", (isOn) => (view.occlusion.enabled = isOn));
 
 function frame(): void {
   scheduler.tick();

@@ -3,10 +3,15 @@
 import * as THREE from "three";
 import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
 import { pinholeOfThreeCamera, poseOfThreeCamera, worldFromCamera } from "./convention";
+import { CropBox } from "./crop_box";
+import { Occlusion } from "./occlusion";
 import { Overlays } from "./overlays";
 import { PictureLayer } from "./picture_layer";
-import type { Scene } from "./protocol";
+import { PointsLayer } from "./points_layer";
+import type { PosedCamera, Scene } from "./protocol";
 import type { View } from "./render_scheduler";
+import { RobotLayer } from "./robot_layer";
+import { surfacePoint } from "./surface_picker";
 
 const VERTICAL_FOV_DEGREES = 50;
 /** Larger windows are rendered at this width and upscaled. */
@@ -15,12 +20,21 @@ const MAX_PICTURE_WIDTH_PX = 1280;
 export const BACKGROUND: [number, number, number] = [0x0b / 255, 0x0e / 255, 0x13 / 255];
 
 export class OrbitView {
-  readonly picture = new PictureLayer();
-  readonly overlays = new Overlays();
+  readonly occlusion = new Occlusion();
+  readonly picture = new PictureLayer(this.occlusion);
+  readonly overlays = new Overlays(this.occlusion);
+  readonly points = new PointsLayer(this.occlusion);
+  readonly robot = new RobotLayer(this.occlusion, () => this.changed());
   private readonly camera = new THREE.PerspectiveCamera(VERTICAL_FOV_DEGREES, 1, 0.01, 200);
+  /** The picture. It is drawn first; the other objects compare their depth with the picture's in their shaders. */
+  private readonly background = new THREE.Scene();
   private readonly world = new THREE.Scene();
   private readonly renderer: THREE.WebGLRenderer;
   private readonly controls: OrbitControls;
+  /** The part of the scene to draw. */
+  readonly crop: CropBox;
+  private followed: THREE.Vector3 | null = null;
+  private followsRobot = false;
   private scene: Scene | null = null;
   private hasUserMoved = false;
   private isStale = true;
@@ -39,8 +53,20 @@ export class OrbitView {
       this.isStale = true;
       onMove();
     });
+    this.crop = new CropBox(this.camera, canvas, () => {
+      this.isStale = true;
+      onMove();
+    });
+    this.world.add(this.crop.root);
     this.controls.addEventListener("start", () => (this.hasUserMoved = true));
-    this.world.add(this.picture.mesh, this.overlays.root);
+    this.renderer.autoClear = false;
+    this.background.add(this.picture.mesh);
+    const light = new THREE.DirectionalLight(0xffffff, 1.6);
+    light.position.set(-0.4, 0.7, 1); // Over the viewer's left shoulder.
+    this.camera.add(light);
+    this.world.add(this.camera, new THREE.HemisphereLight(0xffffff, 0x5a6472, 1.7), this.overlays.root, this.robot.root);
+    this.world.add(this.points.root);
+    canvas.addEventListener("dblclick", (event) => this.pivotAt(event.offsetX, event.offsetY));
     new ResizeObserver(() => {
       this.fit();
       onMove();
@@ -55,6 +81,7 @@ export class OrbitView {
     if (!isNew) return;
     this.isStale = true;
     this.overlays.setScene(scene);
+    this.crop.setScene(scene);
     this.camera.near = Math.max(0.005 * scene.radius_m, 0.005);
     this.camera.far = 400 * this.camera.near + 40 * scene.radius_m;
     this.camera.updateProjectionMatrix();
@@ -80,6 +107,72 @@ export class OrbitView {
     this.controls.update();
   }
 
+  /** Looks at the center of the scene from this direction. */
+  lookAlong(direction: "top" | "front"): void {
+    if (!this.scene) return;
+    const center = new THREE.Vector3(...this.scene.center_m);
+    const halfAngle = (this.camera.fov * Math.PI) / 360;
+    const distance = (1.15 * this.scene.radius_m) / Math.tan(halfAngle) / Math.min(1, this.camera.aspect);
+    // Almost from above: exactly from above, the direction of "up" would be undefined.
+    const from = direction === "top" ? new THREE.Vector3(0, -1e-3, 1) : new THREE.Vector3(0, -1, 0);
+    this.camera.position.copy(center).addScaledVector(from, distance);
+    this.controls.target.copy(center);
+    this.hasUserMoved = true;
+    this.controls.update();
+  }
+
+  /** Looks from the keyframe closest to the current view. */
+  lookFromNearest(keyframes: PosedCamera[]): void {
+    const forward = this.camera.getWorldDirection(new THREE.Vector3());
+    const radius = this.scene?.radius_m ?? 1;
+    const distance = (keyframe: PosedCamera): number => {
+      const pose = worldFromCamera(keyframe.world_from_camera);
+      const away = new THREE.Vector3().setFromMatrixPosition(pose).distanceTo(this.camera.position) / radius;
+      return away + forward.angleTo(new THREE.Vector3().setFromMatrixColumn(pose, 2));
+    };
+    const [nearest] = [...keyframes].sort((a, b) => distance(a) - distance(b));
+    if (!nearest) return;
+    this.hasUserMoved = true;
+    this.lookFrom(nearest.world_from_camera);
+  }
+
+  /** Turns toward the surface at a pixel of the canvas, which becomes the center of the orbit. */
+  private pivotAt(x: number, y: number): void {
+    const depth = this.picture.posedDepth;
+    if (!depth) return;
+    const { clientWidth, clientHeight } = this.canvas;
+    const raycaster = new THREE.Raycaster();
+    raycaster.setFromCamera(
+      new THREE.Vector2((2 * x) / clientWidth - 1, 1 - (2 * y) / clientHeight),
+      this.camera,
+    );
+    const point = surfacePoint(raycaster.ray, depth, this.camera.near, this.camera.far);
+    if (!point) return;
+    this.hasUserMoved = true;
+    this.controls.target.copy(point);
+    this.controls.update();
+  }
+
+  /** Whether the camera moves with the robot. */
+  set follows(follows: boolean) {
+    this.followsRobot = follows;
+    this.followed = follows ? this.robot.tip : null;
+  }
+
+  /** Called when the robot has moved. */
+  follow(): void {
+    const tip = this.followsRobot ? this.robot.tip : null;
+    if (!tip) return;
+    if (this.followed && this.followed.distanceTo(tip) > 0) {
+      const motion = tip.clone().sub(this.followed);
+      this.camera.position.add(motion);
+      this.controls.target.add(motion);
+      this.hasUserMoved = true;
+      this.controls.update();
+    }
+    this.followed = tip;
+  }
+
   /** The current view. */
   view(): View {
     const scale = Math.min(1, MAX_PICTURE_WIDTH_PX / this.canvas.width);
@@ -93,6 +186,7 @@ export class OrbitView {
       projection: pinholeOfThreeCamera(this.camera, size_px),
       near_m: this.camera.near,
       far_m: this.camera.far,
+      crop: this.crop.crop, // Omitted from the message if undefined.
     };
   }
 
@@ -110,6 +204,11 @@ export class OrbitView {
   draw(): void {
     if (!this.isStale) return;
     this.isStale = false;
+    this.picture.setView(worldFromCamera(poseOfThreeCamera(this.camera)));
+    this.crop.update();
+    this.renderer.clear();
+    this.renderer.render(this.background, this.camera);
+    this.renderer.clearDepth();
     this.renderer.render(this.world, this.camera);
   }
 

@@ -2,6 +2,7 @@
 
 import * as THREE from "three";
 import { worldFromCamera } from "./convention";
+import { type Occlusion, ON_SURFACE } from "./occlusion";
 import type { PosedCamera, Scene } from "./protocol";
 
 const KEYFRAME_COLOR = 0xe8edf3;
@@ -11,11 +12,12 @@ export class Overlays {
   readonly root = new THREE.Group();
   private readonly ground = new THREE.Group();
   private readonly cameras = new THREE.Group();
-  private readonly keyframes = lines(KEYFRAME_COLOR, 0.35);
+  private readonly keyframes: THREE.LineSegments;
   private readonly live = new Map<string, THREE.LineSegments>();
   private frustumDepth = 0.06;
 
-  constructor() {
+  constructor(private readonly occlusion: Occlusion) {
+    this.keyframes = this.lines(KEYFRAME_COLOR, 0.35);
     this.keyframes.visible = false; // Hundreds of them would hide the scene.
     this.root.add(this.ground, this.cameras, this.keyframes);
   }
@@ -43,7 +45,9 @@ export class Overlays {
     const middle = [scene.center_m[0], scene.center_m[1]].map((value) => Math.round(value / cell) * cell);
     grid.position.set(middle[0]!, middle[1]!, 0);
     Object.assign(grid.material, { transparent: true, opacity: 0.22, depthWrite: false });
-    this.ground.add(grid, axes(2 * cell));
+    const axesHelper = axes(2 * cell);
+    for (const drawn of [grid, axesHelper]) this.occlusion.apply(drawn.material as THREE.Material, ON_SURFACE);
+    this.ground.add(grid, axesHelper);
   }
 
   setKeyframes(keyframes: PosedCamera[]): void {
@@ -63,7 +67,7 @@ export class Overlays {
     const poseKey = [...camera.world_from_camera, ...camera.focal_px, this.frustumDepth].join();
     if (drawn?.name === poseKey) return false;
     if (!drawn) {
-      drawn = lines(LIVE_COLOR, 1);
+      drawn = this.lines(LIVE_COLOR, 1);
       this.live.set(camera.camera, drawn);
       this.cameras.add(drawn);
     }
@@ -71,13 +75,13 @@ export class Overlays {
     setLines(drawn, frustum(camera, 1.6 * this.frustumDepth));
     return true;
   }
-}
 
-function lines(color: number, opacity: number): THREE.LineSegments {
-  const material = new THREE.LineBasicMaterial({ color, opacity, transparent: true, depthWrite: false });
-  const segments = new THREE.LineSegments(new THREE.BufferGeometry(), material);
-  segments.frustumCulled = false;
-  return segments;
+  private lines(color: number, opacity: number): THREE.LineSegments {
+    const material = new THREE.LineBasicMaterial({ color, opacity, transparent: true, depthWrite: false });
+    const segments = new THREE.LineSegments(new THREE.BufferGeometry(), this.occlusion.apply(material, ON_SURFACE));
+    segments.frustumCulled = false;
+    return segments;
+  }
 }
 
 function setLines(target: THREE.LineSegments, points: THREE.Vector3[]): void {

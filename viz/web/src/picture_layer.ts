@@ -1,12 +1,15 @@
 // The newest picture as a surface in the world: a grid of points displaced by the picture's depth.
 //
 // Viewed from its own pose, the surface reproduces the picture pixel for pixel. Viewed from another pose, while the
-// next picture is pending, it moves like the scene. It also fills the depth buffer, so that the model hides lines
-// behind it.
+// next picture is pending, it moves like the scene. Triangles that span a depth discontinuity are then left out instead
+// of being stretched.
 
 import * as THREE from "three";
+import { decodeCompactDepth } from "./compact_depth";
 import { worldFromCamera } from "./convention";
-import type { PictureHeader } from "./protocol";
+import type { Occlusion } from "./occlusion";
+import type { DepthPart, PictureHeader } from "./protocol";
+import type { PosedDepth } from "./surface_picker";
 
 const N_COLUMNS = 256;
 const N_ROWS = 144;
@@ -31,20 +34,31 @@ const VERTEX = /* glsl */ `
 // exact even where a triangle spans a depth discontinuity.
 const FRAGMENT = /* glsl */ `
   uniform sampler2D colorMap;
+  uniform sampler2D depthMap;
+  uniform float emptyDepth;
+  uniform bool isMoved;
   uniform vec2 sizePx;
   uniform vec2 focalPx;
   uniform vec2 principalPx;
   varying vec3 pointInPicture;
   void main() {
     vec2 uv = (focalPx * pointInPicture.xy / pointInPicture.z + principalPx) / sizePx;
+    if (isMoved) {
+      float depth = texture2D(depthMap, uv).r;
+      if (!(depth > 0.0)) depth = emptyDepth;
+      if (abs(pointInPicture.z - depth) > 0.08 * min(depth, pointInPicture.z)) discard;
+    }
     gl_FragColor = vec4(texture2D(colorMap, uv).rgb, 1.0);
   }`;
 
 export class PictureLayer {
   readonly mesh: THREE.Mesh<THREE.BufferGeometry, THREE.ShaderMaterial>;
+  /** The depth of the shown picture. */
+  posedDepth: PosedDepth | null = null;
+  private isEnabled = true;
   private shown: { id: number; stage: number } | null = null;
 
-  constructor() {
+  constructor(private readonly occlusion: Occlusion) {
     const material = new THREE.ShaderMaterial({
       vertexShader: VERTEX,
       fragmentShader: FRAGMENT,
@@ -56,22 +70,26 @@ export class PictureLayer {
         focalPx: { value: new THREE.Vector2() },
         principalPx: { value: new THREE.Vector2() },
         emptyDepth: { value: 1 },
+        isMoved: { value: false },
       },
       side: THREE.DoubleSide,
-      // Lines that lie on a surface must be visible.
-      polygonOffset: true,
-      polygonOffsetFactor: 1,
-      polygonOffsetUnits: 64,
     });
     this.mesh = new THREE.Mesh(gridGeometry(), material);
     this.mesh.frustumCulled = false;
-    this.mesh.renderOrder = -1;
     this.mesh.visible = false;
   }
 
-  /** Whether the model hides lines behind it; otherwise lines are always in front. */
-  set occludes(occludes: boolean) {
-    this.mesh.material.depthWrite = occludes;
+  /** Whether the picture is drawn. */
+  set enabled(enabled: boolean) {
+    this.isEnabled = enabled;
+    this.mesh.visible = enabled && this.posedDepth !== null;
+  }
+
+  /** Sets the pose of the view, in fieldrig's convention. */
+  setView(worldFromView: THREE.Matrix4): void {
+    const uniforms = this.mesh.material.uniforms as Record<string, THREE.IUniform>;
+    const picture = (uniforms.worldFromPicture!.value as THREE.Matrix4).elements;
+    uniforms.isMoved!.value = worldFromView.elements.some((value, ix) => Math.abs(value - picture[ix]!) > 1e-4);
   }
 
   /** Shows a picture unless a newer one is already shown. Returns whether it did. */
@@ -79,7 +97,10 @@ export class PictureLayer {
     if (header.projection.kind !== "pinhole" || !header.color) return false;
     const { offset, bytes } = header.color;
     const jpeg = new Blob([payload.subarray(offset, offset + bytes)], { type: "image/jpeg" });
-    const bitmap = await createImageBitmap(jpeg, { colorSpaceConversion: "none" });
+    const [bitmap, depth] = await Promise.all([
+      createImageBitmap(jpeg, { colorSpaceConversion: "none" }),
+      unpackDepth(header.depth, payload),
+    ]);
     if (this.shown && (this.shown.id > header.id || (this.shown.id === header.id && this.shown.stage > header.stage))) {
       bitmap.close();
       return false;
@@ -87,13 +108,25 @@ export class PictureLayer {
     this.shown = { id: header.id, stage: header.stage };
     const uniforms = this.mesh.material.uniforms as Record<string, THREE.IUniform>;
     replaceTexture(uniforms.colorMap!, colorTexture(bitmap));
-    replaceTexture(uniforms.depthMap!, unpackDepth(header, payload));
-    uniforms.worldFromPicture!.value = worldFromCamera(header.world_from_camera);
+    replaceTexture(uniforms.depthMap!, depth);
+    const worldFromPicture = worldFromCamera(header.world_from_camera);
+    uniforms.worldFromPicture!.value = worldFromPicture;
     uniforms.sizePx!.value.fromArray(header.full_size_px);
     uniforms.focalPx!.value.fromArray(header.projection.focal_px);
     uniforms.principalPx!.value.fromArray(header.projection.principal_px);
     uniforms.emptyDepth!.value = emptyDepth;
-    this.mesh.visible = true;
+    const { focal_px, principal_px } = header.projection;
+    this.occlusion.setPicture(depth, worldFromPicture, header.full_size_px, focal_px, principal_px);
+    const { data, width, height } = depth.image as { data: Float32Array; width: number; height: number };
+    this.posedDepth = {
+      worldFromPicture,
+      sizePx: header.full_size_px,
+      focalPx: focal_px,
+      principalPx: principal_px,
+      depth: data,
+      depthSizePx: [width, height],
+    };
+    this.mesh.visible = this.isEnabled;
     return true;
   }
 
@@ -126,14 +159,20 @@ function depthTexture(depth: Float32Array<ArrayBuffer>, width: number, height: n
   return texture;
 }
 
-function unpackDepth(header: PictureHeader, payload: Uint8Array<ArrayBuffer>): THREE.DataTexture {
-  const part = header.depth;
+async function unpackDepth(
+  part: DepthPart | null,
+  payload: Uint8Array<ArrayBuffer>,
+): Promise<THREE.DataTexture> {
   if (!part) return depthTexture(new Float32Array(1), 1, 1);
+  const [width, height] = part.size_px;
   // The parts are packed without padding; a copy gives them the alignment that typed arrays need.
-  const bytes = payload.slice(part.offset, part.offset + part.bytes).buffer;
-  const counts = part.format === "f32" ? new Float32Array(bytes) : new Uint16Array(bytes);
+  const bytes = payload.slice(part.offset, part.offset + part.bytes);
+  if (part.format === "compact_half") {
+    return depthTexture(await decodeCompactDepth(bytes, part.size_px, part.min_m, part.log_step), width, height);
+  }
+  const counts = part.format === "f32" ? new Float32Array(bytes.buffer) : new Uint16Array(bytes.buffer);
   const depth = Float32Array.from(counts, (count) => count * part.meters_per_count);
-  return depthTexture(depth, part.size_px[0], part.size_px[1]);
+  return depthTexture(depth, width, height);
 }
 
 function replaceTexture(slot: THREE.IUniform, texture: THREE.Texture): void {

@@ -1,7 +1,21 @@
 // The messages of docs/reference/protocol.md.
 
-/** Protocol version of this page. */
-export const PROTOCOL_VERSION = 3;
+/** Newest protocol version of this page. */
+export const PROTOCOL_VERSION = 4;
+/** Oldest protocol version of this page. */
+export const OLDEST_PROTOCOL_VERSION = 3;
+/** Capabilities that this page can use. */
+export const CAPABILITIES = [
+  "views",
+  "subscribe",
+  "compact_depth",
+  "keyframe_changes",
+  "parts",
+  "heartbeat",
+  "robot",
+  "keyframe_points",
+] as const;
+export type Capability = (typeof CAPABILITIES)[number];
 
 export interface Pinhole {
   kind: "pinhole";
@@ -12,11 +26,21 @@ export interface Pinhole {
 export interface Hello {
   type: "hello";
   protocol: number;
+  /** Oldest and newest version of the server; servers before version 4 have none. */
+  protocols?: [number, number];
+  capabilities?: string[];
   server: string;
   client: number;
   max_size_px: [number, number];
   default_stages: number[];
   clock_millis: number;
+}
+
+/** Reply to the page's hello. */
+export interface Welcome {
+  type: "welcome";
+  protocol: number;
+  capabilities: string[];
 }
 
 /** Status of a model. */
@@ -71,9 +95,64 @@ export interface Keyframes {
   keyframes: PosedCamera[];
 }
 
+/** A keyframe with its number in the server's list. */
+export interface NumberedKeyframe extends PosedCamera {
+  id: number;
+  stamp_nanos: number;
+}
+
+/** What has changed in the list of keyframes; a message from version 0 replaces the list. */
+export interface KeyframeChanges {
+  type: "keyframe_changes";
+  from_version: number;
+  version: number;
+  keyframes: NumberedKeyframe[];
+  removed: number[];
+}
+
+export type RobotShape = {
+  link_from_shape: number[];
+  color_srgba: [number, number, number, number] | null;
+} & (
+  | { kind: "box"; size_m: [number, number, number] }
+  | { kind: "cylinder" | "capsule"; radius_m: number; length_m: number }
+  | { kind: "sphere"; radius_m: number }
+  | { kind: "mesh"; url: string; format: "stl" | "dae" | "obj"; scale: [number, number, number] }
+);
+
+export interface RobotJoint {
+  name: string;
+  kind: "fixed" | "revolute" | "prismatic";
+  parent: string;
+  child: string;
+  parent_from_joint: number[];
+  axis: [number, number, number];
+  mimic: { source: string; multiplier: number; offset: number } | null;
+}
+
+/** Links, joints and shapes of the robot. */
+export interface Robot {
+  type: "robot";
+  name: string;
+  base_link: string;
+  joint_names: string[];
+  links: { name: string; shapes: RobotShape[] }[];
+  joints: RobotJoint[];
+}
+
+/** Joint positions and base pose of the robot. */
+export interface RobotState {
+  type: "robot_state";
+  stamp_nanos: number;
+  captured_millis: number;
+  world_from_base: number[];
+  positions: number[];
+}
+
 export interface ErrorMessage {
   type: "error";
   id: number | null;
+  view?: string;
   message: string;
 }
 
@@ -98,6 +177,7 @@ export interface Goodbye {
 export interface PictureHeader {
   type: "picture";
   id: number;
+  view?: string;
   stage: number;
   n_stages: number;
   scale: number;
@@ -113,14 +193,17 @@ export interface PictureHeader {
   encode_millis: number | null;
   keyframes: number | null;
   color: { format: "jpeg"; offset: number; bytes: number } | null;
-  depth: {
-    format: "u16_half" | "f32";
-    size_px: [number, number];
-    meters_per_count: number;
-    offset: number;
-    bytes: number;
-  } | null;
+  depth: DepthPart | null;
 }
+
+export type DepthPart = {
+  size_px: [number, number];
+  offset: number;
+  bytes: number;
+} & (
+  | { format: "u16_half" | "f32"; meters_per_count: number }
+  | { format: "compact_half"; min_m: number; log_step: number }
+);
 
 export interface LiveImageHeader {
   type: "live_image";
@@ -134,8 +217,51 @@ export interface LiveImageHeader {
   principal_px: [number, number];
 }
 
-export type TextMessage = Hello | Status | Scene | Keyframes | ErrorMessage | Heartbeat | Pong | Goodbye;
-export type BinaryHeader = PictureHeader | LiveImageHeader;
+/** Points of a keyframe, in its camera frame. */
+export interface KeyframePointsHeader {
+  type: "keyframe_points";
+  /** Number of the keyframe. */
+  id: number;
+  n_points: number;
+  meters_per_count: number;
+}
+
+/** A part of a binary message that is `bytes` long. */
+export interface PartHeader {
+  type: "part";
+  message: number;
+  offset: number;
+  bytes: number;
+}
+
+export type TextMessage =
+  | Hello
+  | Welcome
+  | Status
+  | Scene
+  | Keyframes
+  | KeyframeChanges
+  | Robot
+  | RobotState
+  | ErrorMessage
+  | Heartbeat
+  | Pong
+  | Goodbye;
+export type BinaryHeader = PictureHeader | LiveImageHeader | KeyframePointsHeader;
+
+export interface HelloMessage {
+  type: "hello";
+  protocols: [number, number];
+  capabilities: readonly string[];
+}
+
+export interface SubscribeMessage {
+  type: "subscribe";
+  topic: "status" | "keyframes" | "live_images" | "robot_state" | "keyframe_points";
+  rate_hz: number;
+  camera?: string;
+  size_px?: [number, number];
+}
 
 export interface RenderMessage {
   type: "render";
@@ -147,7 +273,9 @@ export interface RenderMessage {
   stages: number[];
   near_m: number;
   far_m: number;
+  crop?: { min_m: [number, number, number]; max_m: [number, number, number] } | undefined;
   outputs: ("color" | "depth")[];
+  depth_format?: "compact_half" | undefined;
   background_srgb: [number, number, number];
 }
 
@@ -156,11 +284,14 @@ export interface PingMessage {
   t: number;
 }
 
-export type ClientMessage = RenderMessage | PingMessage;
+export type ClientMessage = HelloMessage | RenderMessage | SubscribeMessage | PingMessage;
 
 /** Header and payload of a binary message: u32 little-endian header length, JSON header, payload. */
-export function unframe(message: ArrayBuffer): { header: BinaryHeader; payload: Uint8Array<ArrayBuffer> } {
+export function unframe(message: ArrayBuffer): {
+  header: BinaryHeader | PartHeader;
+  payload: Uint8Array<ArrayBuffer>;
+} {
   const nHeader = new DataView(message).getUint32(0, true);
-  const header = JSON.parse(new TextDecoder().decode(new Uint8Array(message, 4, nHeader))) as BinaryHeader;
+  const header = JSON.parse(new TextDecoder().decode(new Uint8Array(message, 4, nHeader))) as BinaryHeader | PartHeader;
   return { header, payload: new Uint8Array(message, 4 + nHeader) };
 }

@@ -21,7 +21,7 @@ export class Readouts {
     const reasons = Object.entries(status.rejected).sort((a, b) => b[1] - a[1]);
     text("rejected-total", count(reasons.reduce((sum, [, n]) => sum + n, 0)));
     element("rejected").replaceChildren(
-      ...reasons.flatMap(([reason, n]) => [child("dt", reason), child("dd", count(n))]),
+      ...reasons.flatMap(([reason, n]) => [child("dt", reason.replaceAll("_", " ")), child("dd", count(n))]),
     );
     element("notes-card").hidden = status.notes.length === 0;
     element("notes").replaceChildren(...status.notes.map((note) => child("li", note)));

@@ -4,6 +4,7 @@
 // the model trains: a periodic refresh of the full picture.
 
 import type { Connection } from "./connection";
+import type { Crop } from "./crop_box";
 import type { PictureHeader, Pinhole, RenderMessage } from "./protocol";
 
 /** The current view of the page. */
@@ -13,6 +14,7 @@ export interface View {
   projection: Pinhole;
   near_m: number;
   far_m: number;
+  crop: Crop | undefined;
 }
 
 const REST_MILLIS = 180;
@@ -115,6 +117,7 @@ export class RenderScheduler {
       ...this.view(),
       stages,
       outputs: ["color", "depth"],
+      depth_format: this.connection.supports("compact_depth") ? "compact_half" : undefined,
       background_srgb: this.background,
     };
     this.connection.send(message);

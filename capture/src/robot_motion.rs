@@ -1,0 +1,114 @@
+//! The current joint positions and base pose of the robot, for viewers.
+
+use crate::config::{BaseDriver, Rig};
+use drivers::Sample;
+use kinematics::{Stamp, Transform};
+
+/// Follows the readings of the robot. Unlike the join, it returns every reading at once, without interpolation.
+#[derive(Clone, Debug)]
+pub struct RobotMotion {
+    /// Number of joints in a reading, and the offset of each.
+    n_joints: usize,
+    joint_offsets: Vec<f64>,
+    /// `None` before the first pose of a moving base.
+    world_from_base: Option<Transform>,
+    has_moving_base: bool,
+}
+
+/// Joint positions and base pose at one time.
+#[derive(Clone, Debug, PartialEq)]
+pub struct RobotReading {
+    /// Time of the reading.
+    pub stamp: Stamp,
+    /// Pose of the base, without the correction of its station.
+    pub world_from_base: Transform,
+    /// Positions of [`Arm::joints`](crate::config::Arm::joints) with their offsets, radians or meters.
+    pub positions: Vec<f64>,
+}
+
+impl RobotMotion {
+    /// The robot of a rig, without readings.
+    #[must_use]
+    pub fn new(rig: &Rig) -> Self {
+        let has_moving_base = rig.base.driver != BaseDriver::Fixed;
+        Self {
+            n_joints: rig.arm.joints.len(),
+            joint_offsets: rig.arm.joint_offsets.clone(),
+            world_from_base: (!has_moving_base).then_some(rig.base.world_from_base),
+            has_moving_base,
+        }
+    }
+
+    /// Takes a sample; returns a reading if the sample moves the robot and the pose of its base is known.
+    pub fn push(&mut self, sample: &Sample) -> Option<RobotReading> {
+        match sample {
+            Sample::Joints(state) => {
+                let is_valid = state.position.len() == self.n_joints && state.position.iter().all(|q| q.is_finite());
+                let offset = |ix: usize| self.joint_offsets.get(ix).copied().unwrap_or_default();
+                let positions = state.position.iter().enumerate().map(|(ix, position)| position + offset(ix)).collect();
+                let world_from_base = self.world_from_base.filter(|_| is_valid)?;
+                Some(RobotReading { stamp: state.stamp, world_from_base, positions })
+            }
+            Sample::Base(pose) if self.has_moving_base && kinematics::transform::is_finite(&pose.world_from_base) => {
+                self.world_from_base = Some(pose.world_from_base);
+                // Readings of the joints come more often than base poses.
+                (self.n_joints == 0).then(|| RobotReading {
+                    stamp: pose.stamp,
+                    world_from_base: pose.world_from_base,
+                    positions: Vec::new(),
+                })
+            }
+            _ => None,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::RobotMotion;
+    use drivers::{BasePose, Sample};
+    use kinematics::{JointState, Stamp, Transform};
+
+    fn joints(position: Vec<f64>) -> Sample {
+        Sample::Joints(JointState { stamp: Stamp(7), position, velocity: Vec::new(), effort: Vec::new() })
+    }
+
+    fn base(x: f64) -> Sample {
+        Sample::Base(BasePose { stamp: Stamp(9), world_from_base: Transform::translation(x, 0.0, 0.0) })
+    }
+
+    fn motion(n_joints: usize, world_from_base: Option<Transform>) -> RobotMotion {
+        RobotMotion {
+            n_joints,
+            joint_offsets: vec![0.1; n_joints],
+            world_from_base,
+            has_moving_base: world_from_base.is_none(),
+        }
+    }
+
+    #[test]
+    fn readings_have_offsets_and_the_latest_base_pose() {
+        let mut moving = motion(2, None);
+        assert_eq!(moving.push(&joints(vec![1.0, 2.0])), None, "the base is nowhere yet");
+        assert_eq!(moving.push(&base(3.0)), None, "the joints follow");
+        let reading = moving.push(&joints(vec![1.0, 2.0])).expect("a reading");
+        assert_eq!((reading.stamp, reading.world_from_base.translation.x), (Stamp(7), 3.0));
+        assert_eq!(reading.positions, [1.1, 2.1]);
+        let mut fixed = motion(2, Some(Transform::identity()));
+        assert_eq!(fixed.push(&base(3.0)), None, "a fixed base does not move");
+        assert_eq!(fixed.push(&joints(vec![0.0, 0.0])).expect("a reading").world_from_base, Transform::identity());
+    }
+
+    #[test]
+    fn invalid_readings_are_ignored() {
+        let mut fixed = motion(2, Some(Transform::identity()));
+        assert_eq!(fixed.push(&joints(vec![1.0])), None);
+        assert_eq!(fixed.push(&joints(vec![1.0, f64::NAN])), None);
+    }
+
+    #[test]
+    fn a_base_without_joints_is_a_robot_too() {
+        let mut moving = motion(0, None);
+        assert_eq!(moving.push(&base(2.0)).expect("a reading").world_from_base.translation.x, 2.0);
+    }
+}

@@ -1,0 +1,129 @@
+//! The robot of a rig as viewers draw it, with the mesh files that its URDF names.
+
+use crate::error::Context;
+use capture::config::{ArmDriver, Rig};
+use kinematics::shape::Geometry;
+use kinematics::urdf::Robot;
+use std::path::{Path, PathBuf};
+use viz::{MeshFormat, RobotDescription, RobotMesh};
+
+/// Maximum size of a mesh file, and of all mesh files of a robot, bytes. Larger ones are not drawn.
+const MAX_FILE_BYTES: u64 = 64 << 20;
+const MAX_TOTAL_BYTES: u64 = 256 << 20;
+
+/// The robot of a rig; `None` if the rig has neither an arm nor a moving base. Shapes that cannot be drawn cause only a
+/// warning.
+///
+/// # Errors
+///
+/// If the URDF is invalid, which [`Rig::load`] rules out.
+pub fn description(rig: &Rig, rig_file: &Path) -> crate::Result<Option<RobotDescription>> {
+    if rig.arm.driver == ArmDriver::None && !rig.has_moving_base() {
+        return Ok(None);
+    }
+    let robot = Robot::parse(&rig.arm.urdf_text).context("the arm's URDF")?;
+    for problem in robot.ignored_shapes() {
+        log::warn!("the robot is drawn incompletely: {problem}");
+    }
+    let folder = Rig::urdf_folder(rig_file).unwrap_or_default();
+    let meshes = meshes(&robot, &folder);
+    let (base_link, joint_names) = (rig.arm.base_link.clone(), rig.arm.joints.clone());
+    Ok(Some(RobotDescription { robot, base_link, joint_names, meshes }))
+}
+
+/// Reads the mesh files of all visual shapes.
+fn meshes(robot: &Robot, urdf_folder: &Path) -> Vec<RobotMesh> {
+    let mut meshes: Vec<RobotMesh> = Vec::new();
+    let mut n_bytes = 0;
+    let shapes = robot.links().iter().flat_map(|link| robot.visuals(link));
+    let files = shapes.filter_map(|shape| match &shape.geometry {
+        Geometry::Mesh { file, .. } => Some(file),
+        _ => None,
+    });
+    for file in files {
+        if meshes.iter().any(|mesh| mesh.file == *file) {
+            continue;
+        }
+        match read(file, urdf_folder, MAX_TOTAL_BYTES - n_bytes) {
+            Ok(mesh) => {
+                n_bytes += mesh.bytes.len() as u64;
+                meshes.push(mesh);
+            }
+            Err(why) => log::warn!("the robot is drawn incompletely: cannot draw the mesh {file:?}: {why}"),
+        }
+    }
+    meshes
+}
+
+/// Reads a mesh file. The error is the reason, in one sentence.
+fn read(file: &str, urdf_folder: &Path, n_free: u64) -> Result<RobotMesh, String> {
+    let format = MeshFormat::of_file(file).ok_or("its type is not supported, convert it to .stl, .dae or .obj")?;
+    let candidates = candidates(file, urdf_folder);
+    let Some(path) = candidates.iter().find(|path| path.is_file()) else {
+        let tried: Vec<_> = candidates.iter().map(|path| path.display().to_string()).collect();
+        return Err(format!("no such file; tried {}", tried.join(", ")));
+    };
+    let shown = path.display();
+    let n_bytes = std::fs::metadata(path).map_err(|error| format!("cannot read {shown}: {error}"))?.len();
+    let max_bytes = MAX_FILE_BYTES.min(n_free);
+    if n_bytes > max_bytes {
+        return Err(format!("{shown} has {n_bytes} bytes, expected at most {max_bytes}: reduce its triangles"));
+    }
+    let bytes = std::fs::read(path).map_err(|error| format!("cannot read {shown}: {error}"))?;
+    Ok(RobotMesh { file: file.to_owned(), format, bytes: bytes.into() })
+}
+
+/// Paths where a mesh file may be. A package is a folder of that name above the URDF, or beside a folder above it.
+fn candidates(file: &str, urdf_folder: &Path) -> Vec<PathBuf> {
+    let package_path = file.strip_prefix("package://").or_else(|| file.strip_prefix("model://"));
+    let Some((package, rest)) = package_path.and_then(|path| path.split_once('/')) else {
+        return vec![urdf_folder.join(file.strip_prefix("file://").unwrap_or(file))];
+    };
+    let above = urdf_folder.ancestors().filter(|folder| !folder.as_os_str().is_empty());
+    let in_folder = |folder: &Path| {
+        let is_package = folder.file_name().is_some_and(|name| name == package);
+        [is_package.then(|| folder.join(rest)), Some(folder.join(package).join(rest))]
+    };
+    above.flat_map(in_folder).flatten().collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::meshes;
+    use kinematics::urdf::Robot;
+    use std::path::Path;
+    use viz::MeshFormat;
+
+    fn robot(files: &[&str]) -> Robot {
+        let mesh = |file: &&str| format!(r#"<visual><geometry><mesh filename="{file}"/></geometry></visual>"#);
+        let shapes: String = files.iter().map(mesh).collect();
+        Robot::parse(&format!(r#"<robot name="r"><link name="a">{shapes}</link></robot>"#)).expect("a robot")
+    }
+
+    fn write(path: &Path, contents: &str) {
+        std::fs::create_dir_all(path.parent().expect("a folder")).expect("created");
+        std::fs::write(path, contents).expect("written");
+    }
+
+    #[test]
+    fn meshes_are_found_beside_the_urdf_and_in_packages() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let root = folder.path();
+        write(&root.join("arm_description/meshes/a.stl"), "a");
+        write(&root.join("arm_description/urdf/b.obj"), "b");
+        write(&root.join("hand_description/c.dae"), "c");
+        let files = [
+            "package://arm_description/meshes/a.stl",
+            "b.obj",
+            "package://hand_description/c.dae",
+            "b.obj",
+            "missing.stl",
+            "package://arm_description/meshes/a.txt",
+        ];
+        let found = meshes(&robot(&files), &root.join("arm_description/urdf"));
+        let found: Vec<_> = found.iter().map(|mesh| (&*mesh.file, mesh.format, mesh.bytes[0])).collect();
+        let expected =
+            [(files[0], MeshFormat::Stl, b'a'), (files[1], MeshFormat::Obj, b'b'), (files[2], MeshFormat::Dae, b'c')];
+        assert_eq!(found, expected);
+    }
+}

@@ -1,0 +1,171 @@
+//! The depth format `compact_half`: differences of logarithmic counts, compressed with zlib.
+//!
+//! Logarithmic counts have the same relative error at all distances. Most differences between neighbors are then 0, and
+//! zlib finds the patterns that repeat from row to row. Predicting from three neighbors gains nothing on real pictures.
+//! `web/src/compact_depth.ts` is the decoder.
+
+use flate2::Compression;
+use flate2::write::ZlibEncoder;
+use std::io::Write;
+use trainer::PackedDepth;
+
+/// Ratio of two consecutive counts, minus 1: depths are wrong by at most half of it, 0.2 %. The models' own errors are
+/// larger.
+const LOG_STEP: f64 = 0.004;
+/// Symbol of a pixel whose count follows in the second part.
+const ESCAPE: u8 = 255;
+/// Largest symbol of a difference between a count and its prediction.
+const MAX_SYMBOL: u16 = 254;
+/// Higher levels take longer and gain little.
+const LEVEL: u32 = 6;
+
+/// A compressed depth map.
+#[derive(Debug)]
+pub(crate) struct CompactDepth {
+    /// Width and height.
+    pub(crate) size_px: [u32; 2],
+    /// Depth of count 1, meters.
+    pub(crate) min_m: f64,
+    /// Natural logarithm of the ratio of two consecutive counts.
+    pub(crate) log_step: f64,
+    /// A zlib stream of symbols, one byte per pixel, and the counts of escaped pixels, 16 bits each.
+    pub(crate) bytes: Vec<u8>,
+}
+
+/// Compresses a depth map.
+pub(crate) fn compress(depth: &PackedDepth) -> std::io::Result<CompactDepth> {
+    let counts: Vec<u16> = depth.counts.chunks_exact(2).map(|count| u16::from_le_bytes([count[0], count[1]])).collect();
+    let nearest = counts.iter().copied().filter(|count| *count > 0).min().unwrap_or(1);
+    let min_m = f64::from(nearest) * depth.meters_per_count;
+    let log_step = LOG_STEP.ln_1p();
+    let coarse = LogCounts::new(nearest, log_step);
+    let codes: Vec<u16> = counts.iter().map(|count| coarse.of(*count)).collect();
+    let width = (depth.size_px[0] as usize).max(1);
+    let (mut symbols, mut escaped) = (Vec::with_capacity(codes.len()), Vec::new());
+    for (ix, &code) in codes.iter().enumerate() {
+        let predicted = prediction(&codes, width, ix);
+        match symbol(code, predicted) {
+            Some(symbol) => symbols.push(symbol),
+            None => {
+                symbols.push(ESCAPE);
+                escaped.extend(code.to_le_bytes());
+            }
+        }
+    }
+    let mut encoder = ZlibEncoder::new(Vec::with_capacity(symbols.len() / 8), Compression::new(LEVEL));
+    encoder.write_all(&symbols)?;
+    encoder.write_all(&escaped)?;
+    Ok(CompactDepth { size_px: depth.size_px, min_m, log_step, bytes: encoder.finish()? })
+}
+
+/// Logarithmic counts of all linear counts.
+struct LogCounts {
+    nearest: u16,
+    of_linear: Vec<u16>,
+}
+
+impl LogCounts {
+    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "ln(65535) / log_step is below 3000")]
+    fn new(nearest: u16, log_step: f64) -> Self {
+        let log_count = |count: u16| (f64::from(count) / f64::from(nearest)).ln() / log_step;
+        Self { nearest, of_linear: (nearest..=u16::MAX).map(|count| log_count(count).round() as u16 + 1).collect() }
+    }
+
+    /// The logarithmic count; 0 if there is no surface.
+    fn of(&self, count: u16) -> u16 {
+        count.checked_sub(self.nearest).map_or(0, |above| self.of_linear[usize::from(above)])
+    }
+}
+
+/// The count to the left predicts a count; in the first column, the count above.
+fn prediction(codes: &[u16], width: usize, ix: usize) -> u16 {
+    let before = if ix.is_multiple_of(width) { ix.checked_sub(width) } else { ix.checked_sub(1) };
+    before.map_or(0, |before| codes[before])
+}
+
+/// The difference to the prediction: 0, -1, 1, -2, 2, ...; `None` if it is too large, or the pixel or its prediction
+/// has no surface but not both.
+fn symbol(code: u16, predicted: u16) -> Option<u8> {
+    if (code == 0) != (predicted == 0) {
+        return None;
+    }
+    let symbol = if code >= predicted { 2 * u32::from(code - predicted) } else { 2 * u32::from(predicted - code) - 1 };
+    u8::try_from(symbol).ok().filter(|symbol| u16::from(*symbol) <= MAX_SYMBOL)
+}
+
+#[cfg(test)]
+pub(crate) mod tests {
+    use super::{CompactDepth, ESCAPE, compress, prediction};
+    use flate2::read::ZlibDecoder;
+    use kinematics::random::Random;
+    use std::io::Read;
+    use trainer::PackedDepth;
+
+    /// Decodes as `docs/reference/protocol.md` describes; depths in meters, 0 without a surface.
+    pub(crate) fn decode(compact: &CompactDepth) -> Vec<f64> {
+        let n = compact.size_px[0] as usize * compact.size_px[1] as usize;
+        let mut bytes = Vec::new();
+        ZlibDecoder::new(&*compact.bytes).read_to_end(&mut bytes).expect("a zlib stream");
+        let mut escaped = bytes[n..].chunks_exact(2).map(|count| u16::from_le_bytes([count[0], count[1]]));
+        let mut codes: Vec<u16> = Vec::new();
+        for (ix, &symbol) in bytes[..n].iter().enumerate() {
+            codes.push(0);
+            let predicted = i32::from(prediction(&codes, compact.size_px[0] as usize, ix));
+            codes[ix] = match symbol {
+                ESCAPE => escaped.next().expect("a count"),
+                symbol => {
+                    let half = i32::from(symbol.div_ceil(2));
+                    u16::try_from(predicted + if symbol % 2 == 0 { half } else { -half }).expect("a count")
+                }
+            };
+        }
+        assert_eq!(escaped.next(), None, "all counts are used");
+        let meters = |code: u16| compact.min_m * (compact.log_step * (f64::from(code) - 1.0)).exp();
+        codes.into_iter().map(|code| if code == 0 { 0.0 } else { meters(code) }).collect()
+    }
+
+    fn packed(size_px: [u32; 2], meters_per_count: f64, count: impl FnMut(u32) -> u16) -> PackedDepth {
+        let counts = (0..size_px[0] * size_px[1]).map(count).flat_map(u16::to_le_bytes).collect();
+        PackedDepth { size_px, meters_per_count, counts }
+    }
+
+    fn check(depth: &PackedDepth) -> usize {
+        let compact = compress(depth).expect("compressed");
+        let decoded = decode(&compact);
+        for (got, count) in decoded.iter().zip(depth.counts.chunks_exact(2)) {
+            let meters = f64::from(u16::from_le_bytes([count[0], count[1]])) * depth.meters_per_count;
+            assert!((got - meters).abs() <= 0.0021 * meters, "{got} instead of {meters}");
+        }
+        compact.bytes.len()
+    }
+
+    #[test]
+    fn all_depths_survive_within_the_stated_error() {
+        let mut random = Random::new(3);
+        for size_px in [[1, 1], [1, 7], [9, 1], [32, 17]] {
+            check(&packed(size_px, 1e-4, |_| 0));
+            check(&packed(size_px, 1e-4, |_| u16::MAX));
+            check(&packed(size_px, 3e-5, |_| u16::try_from(random.below(65_536)).expect("16 bits")));
+            check(&packed(size_px, 3e-5, |ix| if ix % 3 == 0 { 0 } else { 1 + u16::try_from(ix * 7).expect("small") }));
+        }
+        // Every count once.
+        check(&packed([256, 256], 1e-4, |ix| u16::try_from(ix).expect("16 bits")));
+    }
+
+    #[test]
+    fn smooth_surfaces_need_little_space() {
+        // A floor that recedes from 1 m to 6 m, and a ball in front of it.
+        let size_px = [640, 360];
+        let depth = packed(size_px, 1e-4, |ix| {
+            let (x, y) = (f64::from(ix % 640), f64::from(ix / 640));
+            let from_center = (x - 300.0).hypot(y - 200.0) / 90.0;
+            let meters =
+                if from_center < 1.0 { 0.9 - 0.1 * (1.0 - from_center * from_center).sqrt() } else { 6.0 - y / 72.0 };
+            #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "below 6.5 m")]
+            let count = (meters / 1e-4).round() as u16;
+            count
+        });
+        let n_bytes = check(&depth);
+        assert!(n_bytes < 12_000, "{n_bytes} bytes of {}", depth.counts.len());
+    }
+}

@@ -1,0 +1,271 @@
+//! The keyframe list with the order of its changes, so that clients receive only what has changed.
+
+use crate::protocol::MAX_CHANGED_KEYFRAMES;
+use crate::server_message::{NumberedKeyframe, ServerMessage};
+use crate::updates::KeyframePose;
+use std::collections::{BTreeMap, VecDeque};
+use std::sync::Arc;
+
+/// Smaller motions of a keyframe are not sent: they are invisible on a screen, but optimization makes them all the time.
+const NOTICEABLE_M: f64 = 5e-4;
+const NOTICEABLE_RAD: f64 = 5e-4;
+/// Maximum number of remembered removals. A client that has not received older ones gets the complete list.
+const MAX_REMOVALS: usize = 1024;
+
+/// The keyframes, and which version of the list changed them. The version counts single changes.
+#[derive(Clone, Debug)]
+pub(crate) struct KeyframeLog {
+    version: u64,
+    n_added: u64,
+    /// Keyframes by number.
+    keyframes: BTreeMap<u64, Entry>,
+    /// Numbers of the keyframes in the latest list.
+    numbers: BTreeMap<Key, u64>,
+    /// Version and number of removed keyframes.
+    removals: VecDeque<(u64, u64)>,
+    /// Version of the newest removal that is no longer remembered.
+    forgotten: u64,
+}
+
+/// Camera, stamp, and the number of earlier keyframes in the list with the same camera and stamp.
+type Key = (Arc<str>, i64, u32);
+
+#[derive(Clone, Debug)]
+struct Entry {
+    changed: u64,
+    keyframe: KeyframePose,
+}
+
+impl Default for KeyframeLog {
+    /// An empty list. It has version 1, because version 0 means that a client has no list.
+    fn default() -> Self {
+        Self {
+            version: 1,
+            n_added: 0,
+            keyframes: BTreeMap::new(),
+            numbers: BTreeMap::new(),
+            removals: VecDeque::new(),
+            forgotten: 0,
+        }
+    }
+}
+
+impl KeyframeLog {
+    /// Number of changes so far, plus 1.
+    pub(crate) fn version(&self) -> u64 {
+        self.version
+    }
+
+    /// Whether the list has a keyframe with this number.
+    pub(crate) fn contains(&self, number: u64) -> bool {
+        self.keyframes.contains_key(&number)
+    }
+
+    /// Number, camera and stamp of all keyframes, the newest first.
+    pub(crate) fn newest_first(&self) -> impl Iterator<Item = (u64, &KeyframePose)> {
+        self.keyframes.iter().rev().map(|(number, entry)| (*number, &entry.keyframe))
+    }
+
+    /// Replaces the list.
+    pub(crate) fn set(&mut self, keyframes: &[KeyframePose]) {
+        let mut numbers = BTreeMap::new();
+        let mut n_same: BTreeMap<(&str, i64), u32> = BTreeMap::new();
+        for keyframe in keyframes {
+            let n_before = n_same.entry((&*keyframe.camera, keyframe.stamp.0)).or_default();
+            let key = (Arc::clone(&keyframe.camera), keyframe.stamp.0, *n_before);
+            *n_before += 1;
+            let number = self.numbers.remove(&key).unwrap_or_else(|| {
+                self.n_added += 1;
+                self.n_added
+            });
+            if self.keyframes.get(&number).is_none_or(|entry| has_changed(&entry.keyframe, keyframe)) {
+                self.version += 1;
+                let entry = Entry { changed: self.version, keyframe: keyframe.clone() };
+                self.keyframes.insert(number, entry);
+            }
+            numbers.insert(key, number);
+        }
+        // The rest is no longer in the list.
+        for number in std::mem::replace(&mut self.numbers, numbers).into_values() {
+            self.keyframes.remove(&number);
+            self.version += 1;
+            self.removals.push_back((self.version, number));
+        }
+        while self.removals.len() > MAX_REMOVALS {
+            self.forgotten = self.removals.pop_front().map_or(self.forgotten, |(version, _)| version);
+        }
+    }
+
+    /// The next message for a client that has this version of the list, as JSON with the version that it then has;
+    /// `None` if it is up to date. A message from version 0 replaces the client's list.
+    pub(crate) fn next_changes(&self, version: u64) -> Option<(String, u64)> {
+        let from_version = if version < self.forgotten || version > self.version { 0 } else { version };
+        if from_version == self.version {
+            return None;
+        }
+        let mut changed: Vec<_> = self.keyframes.iter().filter(|(_, entry)| entry.changed > from_version).collect();
+        changed.sort_unstable_by_key(|(_, entry)| entry.changed);
+        // A long list is sent in several messages, so that others can be sent in between.
+        let version = match changed.get(MAX_CHANGED_KEYFRAMES) {
+            Some((_, next)) => next.changed - 1,
+            None => self.version,
+        };
+        let keyframes = changed.into_iter().take(MAX_CHANGED_KEYFRAMES);
+        let keyframes = keyframes.map(|(number, entry)| NumberedKeyframe::new(*number, &entry.keyframe)).collect();
+        let is_new = |(at, _): &&(u64, u64)| from_version > 0 && *at > from_version && *at <= version;
+        let removed = self.removals.iter().filter(is_new).map(|(_, number)| *number).collect();
+        Some((ServerMessage::KeyframeChanges { from_version, version, keyframes, removed }.to_json(), version))
+    }
+}
+
+fn has_changed(before: &KeyframePose, after: &KeyframePose) -> bool {
+    let motion = before.world_from_camera.inverse() * after.world_from_camera;
+    let is_same_lens =
+        (before.size_px, before.focal_px, before.principal_px) == (after.size_px, after.focal_px, after.principal_px);
+    !is_same_lens || motion.translation.vector.norm() > NOTICEABLE_M || motion.rotation.angle() > NOTICEABLE_RAD
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{KeyframeLog, MAX_REMOVALS};
+    use crate::protocol::MAX_CHANGED_KEYFRAMES;
+    use crate::updates::KeyframePose;
+    use kinematics::random::Random;
+    use kinematics::{Stamp, Transform};
+    use serde_json::Value;
+    use std::collections::BTreeMap;
+
+    fn keyframe(stamp: i64, x: f64) -> KeyframePose {
+        KeyframePose {
+            camera: "wrist".into(),
+            stamp: Stamp(stamp),
+            world_from_camera: Transform::translation(x, 0.0, 0.0),
+            size_px: [640, 480],
+            focal_px: [600.0; 2],
+            principal_px: [320.0, 240.0],
+        }
+    }
+
+    /// A client's list: stamp and x by number.
+    #[derive(Default)]
+    struct Replica {
+        version: u64,
+        keyframes: BTreeMap<u64, (i64, f64)>,
+        n_received: usize,
+    }
+
+    impl Replica {
+        /// Applies all messages, as `docs/reference/protocol.md` says.
+        fn update(&mut self, log: &KeyframeLog) {
+            while let Some((json, version)) = log.next_changes(self.version) {
+                let message: Value = serde_json::from_str(&json).expect("JSON");
+                if message["from_version"] == 0 {
+                    self.keyframes.clear();
+                }
+                let list = |name: &str| message[name].as_array().expect("a list").clone();
+                assert!(list("keyframes").len() <= MAX_CHANGED_KEYFRAMES);
+                self.n_received += list("keyframes").len();
+                for keyframe in list("keyframes") {
+                    let number = keyframe["id"].as_u64().expect("a number");
+                    let stamp = keyframe["stamp_nanos"].as_i64().expect("a stamp");
+                    self.keyframes.insert(number, (stamp, keyframe["world_from_camera"][3].as_f64().expect("x")));
+                }
+                for number in list("removed") {
+                    self.keyframes.remove(&number.as_u64().expect("a number"));
+                }
+                assert_eq!(message["version"].as_u64(), Some(version));
+                assert!(version > self.version || message["from_version"] == 0, "no progress");
+                self.version = version;
+            }
+        }
+
+        fn sorted(&self) -> Vec<(i64, f64)> {
+            let mut keyframes: Vec<_> = self.keyframes.values().copied().collect();
+            keyframes.sort_by_key(|(stamp, _)| *stamp);
+            keyframes
+        }
+    }
+
+    #[test]
+    fn replicas_follow_random_edits() {
+        let mut random = Random::new(7);
+        let mut log = KeyframeLog::default();
+        let mut list: Vec<(i64, f64)> = Vec::new();
+        let mut replicas = [(); 3].map(|()| Replica::default());
+        for round in 0..400 {
+            for _ in 0..1 + random.below(6) {
+                let is_removal = !list.is_empty() && random.below(3) == 0;
+                if is_removal {
+                    list.remove(random.below(list.len()));
+                } else {
+                    list.push((round * 100 + i64::try_from(list.len()).expect("short"), 1.0));
+                }
+            }
+            if random.below(4) == 0 {
+                list.iter_mut().for_each(|(_, x)| *x += 0.25);
+            }
+            log.set(&list.iter().map(|(stamp, x)| keyframe(*stamp, *x)).collect::<Vec<_>>());
+            // The last client receives messages only sometimes.
+            let n_up_to_date = if round % 57 == 56 { 3 } else { 2 };
+            for replica in &mut replicas[..n_up_to_date] {
+                replica.update(&log);
+                let mut expected = list.clone();
+                expected.sort_by_key(|(stamp, _)| *stamp);
+                assert_eq!(replica.sorted(), expected, "round {round}");
+            }
+        }
+    }
+
+    #[test]
+    fn only_noticeable_changes_are_sent() {
+        let mut log = KeyframeLog::default();
+        let list = |dx: f64| (0..400).map(|ix| keyframe(ix, dx)).collect::<Vec<_>>();
+        let mut replica = Replica::default();
+        replica.update(&log);
+        log.set(&list(0.0));
+        replica.update(&log);
+        assert_eq!(replica.n_received, 400);
+        log.set(&list(1e-4));
+        replica.update(&log);
+        assert_eq!(replica.n_received, 400, "a tenth of a millimeter is not sent");
+        log.set(&[list(1e-4), vec![keyframe(400, 0.0)]].concat());
+        replica.update(&log);
+        assert_eq!(replica.n_received, 401, "only the new keyframe is sent");
+        log.set(&list(0.01));
+        replica.update(&log);
+        assert_eq!((replica.n_received, replica.keyframes.len()), (801, 400));
+    }
+
+    #[test]
+    fn outdated_clients_receive_the_complete_list() {
+        let mut log = KeyframeLog::default();
+        let n = i64::try_from(MAX_REMOVALS).expect("small");
+        log.set(&(0..n + 10).map(|ix| keyframe(ix, 0.0)).collect::<Vec<_>>());
+        let mut replica = Replica::default();
+        replica.update(&log);
+        log.set(&[keyframe(3, 0.0)]);
+        let first: Value = serde_json::from_str(&log.next_changes(replica.version).expect("changes").0).expect("JSON");
+        assert_eq!(first["from_version"], 0);
+        replica.update(&log);
+        assert_eq!(replica.sorted(), [(3, 0.0)]);
+    }
+
+    #[test]
+    fn a_new_client_learns_that_the_list_is_empty() {
+        let log = KeyframeLog::default();
+        let (json, version) = log.next_changes(0).expect("a message");
+        assert!(json.contains("\"keyframes\":[]"), "{json}");
+        assert!(log.next_changes(version).is_none());
+    }
+
+    #[test]
+    fn keyframes_with_the_same_stamp_are_distinct() {
+        let mut log = KeyframeLog::default();
+        let mut replica = Replica::default();
+        for list in [vec![(5, 0.0), (5, 1.0), (5, 2.0)], vec![(5, 0.0), (5, 1.0)], vec![]] {
+            log.set(&list.iter().map(|(stamp, x)| keyframe(*stamp, *x)).collect::<Vec<_>>());
+            replica.update(&log);
+            assert_eq!(replica.sorted(), list);
+        }
+    }
+}

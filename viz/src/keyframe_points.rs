@@ -1,0 +1,133 @@
+//! The depth of a keyframe as colored points, for viewers.
+
+use crate::server_message::{BinaryHeader, PointsHeader, frame};
+use keyframe::{DepthMap, Keyframe};
+use nalgebra::Point3;
+
+/// Maximum number of points per keyframe. A run has hundreds of keyframes that overlap.
+const MAX_POINTS: usize = 2500;
+/// Points whose depth differs from that of a neighbor by more than this fraction are left out: they lie on edges, where
+/// depth cameras report values in between.
+const MAX_EDGE_FRAC: f64 = 0.05;
+
+/// The binary message with the points of a keyframe; `None` if it has no usable depth.
+pub(crate) fn pack_points(id: u64, keyframe: &Keyframe) -> Option<Vec<u8>> {
+    let (points, colors) = points_in_camera(keyframe, keyframe.depth.as_ref()?);
+    let extent_m = points.iter().flat_map(|point| point.coords.iter()).fold(0.0_f64, |max, value| max.max(value.abs()));
+    if points.is_empty() || extent_m <= 0.0 {
+        return None;
+    }
+    let meters_per_count = extent_m / f64::from(i16::MAX);
+    #[expect(clippy::cast_possible_truncation, reason = "the largest coordinate is i16::MAX counts")]
+    let count = |value: &f64| ((value / meters_per_count).round() as i16).to_le_bytes();
+    let positions: Vec<u8> = points.iter().flat_map(|point| point.coords.iter().flat_map(count)).collect();
+    let header = PointsHeader { id, n_points: points.len(), meters_per_count };
+    Some(frame(&BinaryHeader::KeyframePoints(header), &[&positions, &colors]))
+}
+
+/// Points on a regular grid of the depth map, in the frame of the keyframe's color camera, and their colors.
+fn points_in_camera(keyframe: &Keyframe, depth: &DepthMap) -> (Vec<Point3<f64>>, Vec<u8>) {
+    let [width, height] = depth.size_px;
+    let n_px = width as usize * height as usize;
+    let stride = (1..).find(|stride: &usize| n_px / (stride * stride) <= MAX_POINTS).unwrap_or(1);
+    let camera_from_depth = keyframe.world_from_camera.inverse() * depth.world_from_camera;
+    let depth_at = |x: u32, y: u32| f64::from(depth.depth_m[(y * width + x) as usize]);
+    let (mut points, mut colors) = (Vec::new(), Vec::new());
+    for y in (stride as u64 / 2..u64::from(height)).step_by(stride).filter_map(|y| u32::try_from(y).ok()) {
+        for x in (stride as u64 / 2..u64::from(width)).step_by(stride).filter_map(|x| u32::try_from(x).ok()) {
+            let z_m = depth_at(x, y);
+            let neighbors = [(x + 1, y), (x, y + 1)].into_iter().filter(|(x, y)| *x < width && *y < height);
+            let is_edge = neighbors.map(|(x, y)| depth_at(x, y)).any(|other| (other - z_m).abs() > MAX_EDGE_FRAC * z_m);
+            if z_m.is_nan() || z_m <= 0.0 || is_edge {
+                continue;
+            }
+            let point = camera_from_depth * Point3::from(depth.point(x, y, z_m));
+            let Some(color) = color_at(keyframe, &point) else { continue };
+            points.push(point);
+            colors.extend(color);
+        }
+    }
+    (points, colors)
+}
+
+/// Color of the pixel onto which a point projects; `None` outside the image.
+#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "pixels inside the image")]
+fn color_at(keyframe: &Keyframe, point: &Point3<f64>) -> Option<[u8; 3]> {
+    let [width, height] = keyframe.size_px;
+    let u = keyframe.focal_px[0] * point.x / point.z + keyframe.principal_px[0];
+    let v = keyframe.focal_px[1] * point.y / point.z + keyframe.principal_px[1];
+    let is_inside = point.z > 0.0 && (0.0..f64::from(width)).contains(&u) && (0.0..f64::from(height)).contains(&v);
+    if !is_inside {
+        return None;
+    }
+    let pixel = 4 * (v as usize * width as usize + u as usize);
+    keyframe.rgba_srgb.get(pixel..pixel + 3)?.try_into().ok()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{MAX_POINTS, pack_points};
+    use keyframe::{DepthMap, Keyframe, Split};
+    use kinematics::{Stamp, Transform};
+
+    /// A wall at z = 2 m with a box at 1 m in its right half; red on the left, blue on the right.
+    fn wall(size_px: [u32; 2]) -> Keyframe {
+        let is_right = |ix: u32| ix % size_px[0] >= size_px[0] / 2;
+        let pixels = || 0..size_px[0] * size_px[1];
+        let rgba = pixels().flat_map(|ix| if is_right(ix) { [0, 0, 200, 255] } else { [200, 0, 0, 255] });
+        let world_from_camera = Transform::translation(5.0, 0.0, 0.0);
+        let (focal_px, principal_px) = ([100.0; 2], size_px.map(|side| 0.5 * f64::from(side)));
+        Keyframe {
+            camera: "wrist".into(),
+            stamp: Stamp(1),
+            size_px,
+            focal_px,
+            principal_px,
+            rgba_srgb: rgba.collect(),
+            depth: Some(DepthMap {
+                size_px,
+                focal_px,
+                principal_px,
+                depth_m: pixels().map(|ix| if is_right(ix) { 1.0 } else { 2.0 }).collect(),
+                world_from_camera,
+            }),
+            world_from_camera,
+            twist: None,
+            readout_secs: 0.0,
+            joint_twists: [].into(),
+            base: None,
+            split: Split::Train,
+            truth: None,
+        }
+    }
+
+    #[test]
+    fn points_have_positions_and_colors_of_the_surface() {
+        let message = pack_points(7, &wall([160, 120])).expect("points");
+        let n_header = u32::from_le_bytes(message[..4].try_into().expect("4 bytes")) as usize;
+        let header: serde_json::Value = serde_json::from_slice(&message[4..4 + n_header]).expect("JSON");
+        let n = usize::try_from(header["n_points"].as_u64().expect("a number")).expect("small");
+        assert!(header["id"] == 7 && n <= MAX_POINTS && n > MAX_POINTS / 4, "{header}");
+        let (positions, colors) = message[4 + n_header..].split_at(6 * n);
+        assert_eq!(colors.len(), 3 * n);
+        let scale = header["meters_per_count"].as_f64().expect("a scale");
+        let coordinate = |bytes: &[u8]| f64::from(i16::from_le_bytes([bytes[0], bytes[1]])) * scale;
+        let (mut n_left, mut n_right) = (0, 0);
+        for (position, color) in positions.chunks_exact(6).zip(colors.chunks_exact(3)) {
+            let [x, z] = [coordinate(&position[..2]), coordinate(&position[4..])];
+            // In the camera's frame, not in the world's.
+            let (expected_z, expected_color) = if x < 0.0 { (2.0, [200, 0, 0]) } else { (1.0, [0, 0, 200]) };
+            assert!((z - expected_z).abs() < 1e-3 && color == expected_color, "{x} {z} {color:?}");
+            *(if x < 0.0 { &mut n_left } else { &mut n_right }) += 1;
+        }
+        assert!(n_left > n / 3 && n_right > n / 3, "{n_left} {n_right}");
+    }
+
+    #[test]
+    fn keyframes_without_depth_have_no_points() {
+        let mut keyframe = wall([16, 12]);
+        keyframe.depth = keyframe.depth.map(|depth| DepthMap { depth_m: vec![0.0; 192].into(), ..depth });
+        assert!(pack_points(1, &keyframe).is_none());
+        assert!(pack_points(1, &Keyframe { depth: None, ..keyframe }).is_none());
+    }
+}

@@ -1,0 +1,115 @@
+//! Estimates how fast a client's connection transfers data, so that little of it waits in buffers.
+
+use std::time::Duration;
+
+/// Data handed to the kernel at once, and data in the kernel's buffer, as transfer times. Together they stay below
+/// 100 ms, even if the estimate is too high by a half.
+const PART_TIME: f64 = 0.02;
+const BUFFER_TIME: f64 = 0.04;
+/// Limits of both, bytes. Larger parts and buffers do not make fast connections faster.
+const PART_BYTES: std::ops::RangeInclusive<f64> = 4096.0..=65_536.0;
+const BUFFER_BYTES: std::ops::RangeInclusive<f64> = 8192.0..=65_536.0;
+/// Rate before the first measurement: an ordinary wireless link.
+const INITIAL_BYTES_PER_SEC: f64 = 1.25e6;
+/// Shorter sends do not measure the link, but the memory of this computer.
+const MIN_SEND_SECS: f64 = 2e-4;
+/// The estimate follows decreases quickly, but increases slowly.
+const MAX_INCREASE: f64 = 1.25;
+/// After a longer pause, the kernel's buffer may be empty. Data that fits into it then seems to be sent at once.
+const MAX_PAUSE: Duration = Duration::from_millis(5);
+
+/// Transfer rate of a connection.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct LinkRate {
+    bytes_per_sec: f64,
+    /// Bytes and time of the sends since the last pause.
+    burst_bytes: f64,
+    burst_secs: f64,
+}
+
+impl Default for LinkRate {
+    fn default() -> Self {
+        Self { bytes_per_sec: INITIAL_BYTES_PER_SEC, burst_bytes: 0.0, burst_secs: 0.0 }
+    }
+}
+
+impl LinkRate {
+    /// Records that the kernel accepted data after this time, and the pause before it.
+    pub(crate) fn observe(&mut self, n_bytes: usize, took: Duration, pause: Duration) {
+        if pause > MAX_PAUSE {
+            (self.burst_bytes, self.burst_secs) = (0.0, 0.0);
+        }
+        let secs = took.as_secs_f64().max(MIN_SEND_SECS);
+        self.burst_bytes += n_bytes as f64;
+        self.burst_secs += secs + pause.min(MAX_PAUSE).as_secs_f64();
+        let measured = n_bytes as f64 / secs;
+        if measured < self.bytes_per_sec {
+            self.bytes_per_sec = 0.5 * (self.bytes_per_sec + measured);
+            return;
+        }
+        // Without the data that is still in the buffer.
+        let over_burst = (self.burst_bytes - self.buffer_bytes() as f64) / self.burst_secs;
+        if over_burst > self.bytes_per_sec {
+            self.bytes_per_sec = over_burst.min(self.bytes_per_sec * MAX_INCREASE);
+        }
+    }
+
+    /// Size of the parts of long messages.
+    pub(crate) fn part_bytes(self) -> usize {
+        bytes_in(self.bytes_per_sec * PART_TIME, PART_BYTES)
+    }
+
+    /// Size of the kernel's send buffer.
+    pub(crate) fn buffer_bytes(self) -> usize {
+        bytes_in(self.bytes_per_sec * BUFFER_TIME, BUFFER_BYTES)
+    }
+}
+
+#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "limited to a range of sizes")]
+fn bytes_in(bytes: f64, range: std::ops::RangeInclusive<f64>) -> usize {
+    bytes.clamp(*range.start(), *range.end()) as usize
+}
+
+#[cfg(test)]
+mod tests {
+    use super::LinkRate;
+    use std::time::Duration;
+
+    /// Simulates a link with a kernel buffer. Returns the largest time that data waits once the estimate has settled.
+    fn longest_wait_secs(link_bytes_per_sec: f64) -> f64 {
+        let mut rate = LinkRate::default();
+        let (mut buffered, mut longest) = (0.0_f64, 0.0_f64);
+        for ix in 0..400 {
+            let (part, buffer) = (rate.part_bytes(), rate.buffer_bytes() as f64);
+            // The kernel accepts the part as soon as its buffer has room for the end of it.
+            let excess = (buffered + part as f64 - buffer).max(0.0);
+            let secs = excess / link_bytes_per_sec;
+            buffered = (buffered + part as f64 - excess).max(0.0);
+            if ix > 50 {
+                longest = longest.max((buffered + part as f64) / link_bytes_per_sec);
+            }
+            // A pause now and then empties the buffer.
+            let pause = if ix % 37 == 0 { 0.5 } else { 0.0 };
+            rate.observe(part, Duration::from_secs_f64(secs), Duration::from_secs_f64(pause));
+            buffered = (buffered - pause * link_bytes_per_sec).max(0.0);
+        }
+        longest
+    }
+
+    #[test]
+    fn at_most_100_ms_wait_unsent() {
+        for megabits in [2.0, 5.0, 20.0, 100.0, 1000.0] {
+            let wait = longest_wait_secs(megabits * 1e6 / 8.0);
+            assert!(wait < 0.1, "{megabits} Mbit/s: {wait} s");
+        }
+    }
+
+    #[test]
+    fn fast_links_get_large_parts() {
+        let mut rate = LinkRate::default();
+        for _ in 0..40 {
+            rate.observe(rate.part_bytes(), Duration::from_micros(20), Duration::ZERO);
+        }
+        assert_eq!((rate.part_bytes(), rate.buffer_bytes()), (65_536, 65_536));
+    }
+}

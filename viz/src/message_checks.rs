@@ -1,0 +1,103 @@
+//! Checks the messages of viewers: every accepted request must be safe to render, and every accepted subscription must
+//! keep its limits. The fuzz target `page` includes this file.
+
+use crate::negotiation::{CAPABILITIES, negotiate};
+use crate::protocol::{
+    BASE_PROTOCOL_VERSION, ClientHello, ClientMessage, MAX_RATE_HZ, PROTOCOL_VERSION, RenderMessage, SubscribeMessage,
+};
+use crate::subscriptions::{Subscriptions, fitted};
+use crate::view_request::{MAX_SIZE_PX, ViewRequest};
+use trainer::{Projection, RenderRequest};
+
+/// Handles the messages of a session, one per line, and panics if a result is inconsistent.
+pub(crate) fn check_session(session: &str) {
+    let mut subscriptions = Subscriptions::default();
+    for text in session.lines() {
+        match serde_json::from_str(text) {
+            Ok(ClientMessage::Hello(hello)) => check_hello(&hello),
+            Ok(ClientMessage::Render(message)) => check_render(&message),
+            Ok(ClientMessage::Subscribe(message)) => check_subscription(&mut subscriptions, message),
+            Ok(ClientMessage::Ping(_) | ClientMessage::Goodbye(_)) | Err(_) => {}
+        }
+    }
+}
+
+fn check_hello(hello: &ClientHello) {
+    match negotiate(hello) {
+        Ok(agreement) => {
+            assert!((BASE_PROTOCOL_VERSION..=PROTOCOL_VERSION).contains(&agreement.protocol));
+            assert!(agreement.names.len() <= CAPABILITIES.len());
+            assert!(agreement.names.iter().all(|name| hello.capabilities.iter().any(|wanted| wanted == name)));
+        }
+        Err(reason) => assert!(!reason.is_empty() && !reason.contains('\n')),
+    }
+}
+
+fn check_render(message: &RenderMessage) {
+    let Ok(request) = ViewRequest::check(message) else { return };
+    for stage in 0..request.stages.len() {
+        let RenderRequest { size_px, projection, world_from_camera, .. } = request.stage_request(stage);
+        assert!(size_px.iter().all(|n| (1..=MAX_SIZE_PX).contains(n)));
+        assert!(kinematics::transform::is_finite(&world_from_camera));
+        if let Projection::Pinhole { focal_px, principal_px } = projection {
+            assert!(focal_px.iter().chain(&principal_px).all(|number| number.is_finite()));
+        }
+    }
+}
+
+fn check_subscription(subscriptions: &mut Subscriptions, message: SubscribeMessage) {
+    let camera = message.camera.clone().unwrap_or_default();
+    let before = subscriptions.clone();
+    if subscriptions.apply(message).is_err() {
+        assert!(*subscriptions == before, "a rejected message changes nothing");
+        return;
+    }
+    let images = subscriptions.images_of(&camera);
+    let periods = [subscriptions.status, subscriptions.keyframes, subscriptions.robot_state, images.period];
+    assert!(periods.into_iter().flatten().all(|period| period.as_secs_f64() >= 0.999 / MAX_RATE_HZ));
+    for size_px in [[640, 480], [1, 4000], [4096, 1]] {
+        let fitted = fitted(size_px, images.max_px);
+        assert!((0..2).all(|axis| (1..=size_px[axis]).contains(&fitted[axis])), "{size_px:?} became {fitted:?}");
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::check_session;
+    use kinematics::random::Random;
+    use std::path::Path;
+
+    /// The seeds of the fuzz target, unchanged and with changed, removed and repeated bytes.
+    #[test]
+    fn corrupted_messages_are_handled() {
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../fuzz/seeds/page");
+        let mut random = Random::new(11);
+        let mut n_seeds = 0;
+        for entry in std::fs::read_dir(folder).expect("the seeds") {
+            let seed = std::fs::read_to_string(entry.expect("a file").path()).expect("text");
+            check_session(&seed);
+            for _ in 0..2000 {
+                let mut bytes = seed.clone().into_bytes();
+                for _ in 0..=random.below(3) {
+                    let at = random.below(bytes.len());
+                    match random.below(4) {
+                        0 => bytes[at] = u8::try_from(32 + random.below(95)).expect("ASCII"),
+                        1 => drop(bytes.remove(at)),
+                        2 => bytes.insert(at, b"0123456789e-.,[]{}\"\n"[random.below(20)]),
+                        _ => {
+                            let end = (at + random.below(40)).min(bytes.len());
+                            let section = bytes[at..end].to_vec();
+                            bytes.splice(at..at, section);
+                        }
+                    }
+                    if bytes.is_empty() {
+                        break;
+                    }
+                }
+                check_session(&String::from_utf8_lossy(&bytes));
+            }
+            n_seeds += 1;
+        }
+        assert!(n_seeds >= 3, "only {n_seeds} seeds");
+    }
+}

@@ -1,0 +1,19 @@
+//! What all sessions of a server share.
+
+use crate::Hub;
+use crate::broadcast::LatestMessages;
+use crate::clock::ServerClock;
+use tokio::sync::watch;
+
+/// Shared by all sessions.
+#[derive(Clone)]
+pub(crate) struct ServerContext {
+    /// Takes requests and returns pictures.
+    pub(crate) hub: Hub,
+    /// The server's clock.
+    pub(crate) clock: ServerClock,
+    /// The latest encoded messages.
+    pub(crate) latest_messages: watch::Receiver<LatestMessages>,
+    /// Becomes true when the server stops.
+    pub(crate) stopped: watch::Receiver<bool>,
+}

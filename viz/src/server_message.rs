@@ -1,0 +1,229 @@
+//! The messages from the server, as in `docs/reference/protocol.md`.
+
+use crate::clock::ServerClock;
+use crate::pose::row_major;
+use crate::protocol::{DepthFormat, ProjectionMessage};
+use crate::robot::{RobotMessage, RobotStateMessage};
+use crate::updates::{KeyframePose, LiveImage, SceneHint, Status};
+use serde::Serialize;
+
+/// JSON text messages from the server.
+#[derive(Debug, Serialize)]
+#[serde(tag = "type", rename_all = "snake_case")]
+pub(crate) enum ServerMessage<'a> {
+    /// First message of a connection.
+    Hello {
+        protocol: u32,
+        protocols: [u32; 2],
+        capabilities: &'a [&'a str],
+        server: &'a str,
+        client: u64,
+        max_size_px: [u32; 2],
+        default_stages: &'a [f64],
+        clock_millis: f64,
+    },
+    /// Reply to the client's hello: what the connection uses from now on.
+    Welcome { protocol: u32, capabilities: Vec<&'static str> },
+    /// Status of the run.
+    Status(&'a Status),
+    /// Scene extent and initial view.
+    Scene { center_m: [f64; 3], radius_m: f64, world_from_camera: [f64; 16] },
+    /// Poses of all stored keyframes.
+    Keyframes { keyframes: Vec<KeyframeMessage<'a>> },
+    /// Keyframes that were added, changed or removed since a version of the list.
+    KeyframeChanges { from_version: u64, version: u64, keyframes: Vec<NumberedKeyframe<'a>>, removed: Vec<u64> },
+    /// Links, joints and shapes of the robot.
+    Robot(&'a RobotMessage<'a>),
+    /// Joint positions and base pose of the robot.
+    RobotState(RobotStateMessage),
+    /// Reason why a message was invalid or a picture failed.
+    Error {
+        id: Option<u64>,
+        #[serde(skip_serializing_if = "Option::is_none")]
+        view: Option<&'a str>,
+        message: &'a str,
+    },
+    /// Sent at a fixed rate, so that silence indicates a broken connection.
+    Heartbeat { clock_millis: f64 },
+    /// Reply to a client's `ping`.
+    Pong { t: f64, clock_millis: f64 },
+    /// Ends the connection.
+    Goodbye { reason: &'a str },
+}
+
+/// One keyframe of `keyframes`.
+#[derive(Debug, Serialize)]
+pub(crate) struct KeyframeMessage<'a> {
+    camera: &'a str,
+    world_from_camera: [f64; 16],
+    size_px: [u32; 2],
+    focal_px: [f64; 2],
+    principal_px: [f64; 2],
+}
+
+impl<'a> From<&'a KeyframePose> for KeyframeMessage<'a> {
+    fn from(keyframe: &'a KeyframePose) -> Self {
+        Self {
+            camera: &keyframe.camera,
+            world_from_camera: row_major(&keyframe.world_from_camera),
+            size_px: keyframe.size_px,
+            focal_px: keyframe.focal_px,
+            principal_px: keyframe.principal_px,
+        }
+    }
+}
+
+/// One keyframe of `keyframe_changes`.
+#[derive(Debug, Serialize)]
+pub(crate) struct NumberedKeyframe<'a> {
+    id: u64,
+    stamp_nanos: i64,
+    #[serde(flatten)]
+    keyframe: KeyframeMessage<'a>,
+}
+
+impl<'a> NumberedKeyframe<'a> {
+    /// A keyframe with its number.
+    pub(crate) fn new(id: u64, keyframe: &'a KeyframePose) -> Self {
+        Self { id, stamp_nanos: keyframe.stamp.0, keyframe: keyframe.into() }
+    }
+}
+
+impl From<&SceneHint> for ServerMessage<'_> {
+    fn from(hint: &SceneHint) -> Self {
+        Self::Scene {
+            center_m: hint.center_m,
+            radius_m: hint.radius_m,
+            world_from_camera: row_major(&hint.world_from_camera),
+        }
+    }
+}
+
+/// Header of a binary message.
+#[derive(Debug, Serialize)]
+#[serde(tag = "type", rename_all = "snake_case")]
+pub(crate) enum BinaryHeader<'a> {
+    /// A rendered picture.
+    Picture(&'a PictureHeader),
+    /// The current image of a camera.
+    LiveImage(&'a LiveHeader<'a>),
+    /// Points of a keyframe.
+    KeyframePoints(PointsHeader),
+    /// A part of a binary message.
+    Part(PartHeader),
+}
+
+/// Header of `keyframe_points`.
+#[derive(Clone, Copy, Debug, Serialize)]
+pub(crate) struct PointsHeader {
+    pub(crate) id: u64,
+    pub(crate) n_points: usize,
+    pub(crate) meters_per_count: f64,
+}
+
+/// Header of `part`.
+#[derive(Clone, Copy, Debug, Serialize)]
+pub(crate) struct PartHeader {
+    pub(crate) message: u64,
+    pub(crate) offset: usize,
+    pub(crate) bytes: usize,
+}
+
+/// Header of `picture`.
+#[derive(Debug, Serialize)]
+pub(crate) struct PictureHeader {
+    pub(crate) id: u64,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(crate) view: Option<String>,
+    pub(crate) stage: usize,
+    pub(crate) n_stages: usize,
+    pub(crate) scale: f64,
+    pub(crate) last: bool,
+    pub(crate) size_px: [u32; 2],
+    pub(crate) full_size_px: [u32; 2],
+    pub(crate) world_from_camera: [f64; 16],
+    pub(crate) projection: ProjectionMessage,
+    pub(crate) near_m: f64,
+    pub(crate) far_m: f64,
+    pub(crate) waited_millis: f64,
+    pub(crate) render_millis: f64,
+    pub(crate) encode_millis: Option<f64>,
+    pub(crate) keyframes: Option<u64>,
+    pub(crate) color: Option<ColorPart>,
+    pub(crate) depth: Option<DepthPart>,
+}
+
+/// Position of the color in the payload.
+#[derive(Debug, Serialize)]
+pub(crate) struct ColorPart {
+    pub(crate) format: &'static str,
+    pub(crate) offset: usize,
+    pub(crate) bytes: usize,
+}
+
+/// Position of the depth in the payload, and its encoding.
+#[derive(Debug, Serialize)]
+pub(crate) struct DepthPart {
+    pub(crate) format: DepthFormat,
+    pub(crate) size_px: [u32; 2],
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(crate) meters_per_count: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(crate) min_m: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(crate) log_step: Option<f64>,
+    pub(crate) offset: usize,
+    pub(crate) bytes: usize,
+}
+
+/// Header of `live_image`.
+#[derive(Debug, Serialize)]
+pub(crate) struct LiveHeader<'a> {
+    camera: &'a str,
+    stamp_nanos: i64,
+    captured_millis: f64,
+    size_px: [u32; 2],
+    format: &'static str,
+    world_from_camera: Option<[f64; 16]>,
+    focal_px: [f64; 2],
+    principal_px: [f64; 2],
+}
+
+impl<'a> LiveHeader<'a> {
+    /// The header of an image that is sent at `size_px`.
+    pub(crate) fn new(image: &'a LiveImage, size_px: [u32; 2], clock: ServerClock) -> Self {
+        let scale = [0, 1].map(|axis| f64::from(size_px[axis]) / f64::from(image.size_px[axis]));
+        let scaled = |values: [f64; 2]| [values[0] * scale[0], values[1] * scale[1]];
+        Self {
+            camera: &image.camera,
+            stamp_nanos: image.stamp.0,
+            captured_millis: clock.millis(image.captured_at),
+            size_px,
+            format: "jpeg",
+            world_from_camera: image.world_from_camera.as_ref().map(row_major),
+            focal_px: scaled(image.focal_px),
+            principal_px: scaled(image.principal_px),
+        }
+    }
+}
+
+impl ServerMessage<'_> {
+    /// The message as JSON.
+    pub(crate) fn to_json(&self) -> String {
+        serde_json::to_string(self).expect("these types hold only strings, numbers and maps with string keys")
+    }
+}
+
+/// A binary message: header length as little-endian u32, JSON header, payload.
+pub(crate) fn frame(header: &BinaryHeader<'_>, payload: &[&[u8]]) -> Vec<u8> {
+    let header = serde_json::to_vec(header).expect("these types hold only strings and numbers");
+    let n_header = u32::try_from(header.len()).expect("a header has some hundred bytes");
+    let n_payload: usize = payload.iter().map(|part| part.len()).sum();
+    let mut bytes = Vec::with_capacity(4 + header.len() + n_payload);
+    bytes.extend_from_slice(&n_header.to_le_bytes());
+    bytes.extend_from_slice(&header);
+    for part in payload {
+        bytes.extend_from_slice(part);
+    }
+    bytes
+}

@@ -1,0 +1,183 @@
+//! How often and at which size a client receives each kind of data.
+
+use crate::protocol::{MAX_RATE_HZ, SubscribeMessage, Topic};
+use crate::view_request::InvalidRequest;
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::Duration;
+
+/// Maximum number of cameras with a subscription of their own.
+const MAX_CAMERAS: usize = 64;
+/// Maximum length of a camera name, bytes.
+const MAX_NAME_BYTES: usize = 256;
+/// Maximum size of live images unless a client subscribes to another one: 640 pixels wide, any height.
+const DEFAULT_IMAGE_PX: [u32; 2] = [640, u32::MAX];
+/// Minimum size of live images, pixels.
+const MIN_IMAGE_PX: u32 = 16;
+
+/// The subscriptions of one client.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct Subscriptions {
+    /// Minimum time between two messages; `None` if the topic is not sent.
+    pub(crate) status: Option<Duration>,
+    /// The same for the keyframe list or its changes.
+    pub(crate) keyframes: Option<Duration>,
+    /// Number of subscriptions to keyframes so far. Each of them begins with the complete list.
+    pub(crate) n_keyframe_lists: u64,
+    /// The same for the joint positions.
+    pub(crate) robot_state: Option<Duration>,
+    /// The same for the points of keyframes.
+    pub(crate) keyframe_points: Option<Duration>,
+    /// Images of cameras without a subscription of their own.
+    live_images: ImageSubscription,
+    /// Images of single cameras.
+    cameras: BTreeMap<Arc<str>, ImageSubscription>,
+}
+
+/// Subscription to the images of a camera.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct ImageSubscription {
+    /// Minimum time between two images; `None` if none are sent.
+    pub(crate) period: Option<Duration>,
+    /// Maximum width and height. Larger images are downscaled.
+    pub(crate) max_px: [u32; 2],
+}
+
+impl Default for Subscriptions {
+    fn default() -> Self {
+        Self {
+            status: Some(Duration::from_millis(190)),
+            keyframes: Some(Duration::from_secs(1)),
+            n_keyframe_lists: 0,
+            robot_state: None,
+            keyframe_points: None,
+            live_images: ImageSubscription { period: Some(Duration::from_millis(190)), max_px: DEFAULT_IMAGE_PX },
+            cameras: BTreeMap::new(),
+        }
+    }
+}
+
+impl Subscriptions {
+    /// Applies a client's message.
+    pub(crate) fn apply(&mut self, message: SubscribeMessage) -> Result<(), InvalidRequest> {
+        let SubscribeMessage { topic, rate_hz, camera, size_px } = message;
+        if !(0.0..=MAX_RATE_HZ).contains(&rate_hz) {
+            return Err(InvalidRequest::Rate { got: rate_hz });
+        }
+        if topic != Topic::LiveImages && (camera.is_some() || size_px.is_some()) {
+            return Err(InvalidRequest::NotImages);
+        }
+        if let Some(got) = size_px.filter(|size_px| size_px.iter().any(|side| *side < MIN_IMAGE_PX)) {
+            return Err(InvalidRequest::ImageSize { got, min: MIN_IMAGE_PX });
+        }
+        let period = (rate_hz > 0.0).then(|| Duration::try_from_secs_f64(1.0 / rate_hz).unwrap_or(Duration::MAX));
+        match topic {
+            Topic::Status => self.status = period,
+            Topic::Keyframes => {
+                self.keyframes = period;
+                self.n_keyframe_lists += 1;
+            }
+            Topic::RobotState => self.robot_state = period,
+            Topic::KeyframePoints => self.keyframe_points = period,
+            Topic::LiveImages => {
+                let images = ImageSubscription { period, max_px: size_px.unwrap_or(DEFAULT_IMAGE_PX) };
+                match camera {
+                    None => self.live_images = images,
+                    Some(camera) => self.set_camera(camera, images)?,
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// The subscription to the images of a camera.
+    pub(crate) fn images_of(&self, camera: &str) -> ImageSubscription {
+        self.cameras.get(camera).copied().unwrap_or(self.live_images)
+    }
+
+    fn set_camera(&mut self, camera: String, images: ImageSubscription) -> Result<(), InvalidRequest> {
+        let is_known = self.cameras.contains_key(&*camera);
+        if camera.len() > MAX_NAME_BYTES || (!is_known && self.cameras.len() >= MAX_CAMERAS) {
+            return Err(InvalidRequest::Cameras { max: MAX_CAMERAS, max_bytes: MAX_NAME_BYTES });
+        }
+        self.cameras.insert(camera.into(), images);
+        Ok(())
+    }
+}
+
+/// The largest size within `max_px` that has the aspect ratio of `size_px`, and at least one pixel. Images are never
+/// enlarged.
+#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "smaller than the image")]
+pub(crate) fn fitted(size_px: [u32; 2], max_px: [u32; 2]) -> [u32; 2] {
+    let ratio = |axis: usize| f64::from(max_px[axis]) / f64::from(size_px[axis].max(1));
+    let scale = ratio(0).min(ratio(1)).min(1.0);
+    size_px.map(|side| ((f64::from(side) * scale).round() as u32).clamp(1, side.max(1)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{MAX_CAMERAS, Subscriptions, fitted};
+    use crate::protocol::SubscribeMessage;
+    use serde_json::{Value, json};
+    use std::time::Duration;
+
+    fn apply(subscriptions: &mut Subscriptions, message: Value) -> Result<(), String> {
+        let message = serde_json::from_value::<SubscribeMessage>(message).map_err(|error| error.to_string())?;
+        subscriptions.apply(message).map_err(|error| error.to_string())
+    }
+
+    #[test]
+    fn cameras_have_their_own_size_and_rate() {
+        let mut subscriptions = Subscriptions::default();
+        assert_eq!(subscriptions.images_of("wrist").max_px[0], 640);
+        apply(&mut subscriptions, json!({"topic": "live_images", "rate_hz": 2.0, "size_px": [240, 240]}))
+            .expect("valid");
+        apply(&mut subscriptions, json!({"topic": "live_images", "rate_hz": 0, "camera": "rear"})).expect("valid");
+        assert_eq!(subscriptions.images_of("wrist").max_px, [240, 240]);
+        assert_eq!(subscriptions.images_of("wrist").period, Some(Duration::from_millis(500)));
+        assert_eq!(subscriptions.images_of("rear").period, None);
+        assert_eq!(subscriptions.robot_state, None, "costs nothing until a client subscribes");
+        apply(&mut subscriptions, json!({"topic": "robot_state", "rate_hz": 50})).expect("valid");
+        assert_eq!(subscriptions.robot_state, Some(Duration::from_millis(20)));
+        // The slowest rate that a number can express is no error.
+        apply(&mut subscriptions, json!({"topic": "status", "rate_hz": 5e-324})).expect("valid");
+        assert_eq!(subscriptions.status, Some(Duration::MAX));
+    }
+
+    #[test]
+    fn invalid_subscriptions_are_rejected() {
+        let mut subscriptions = Subscriptions::default();
+        for (message, named) in [
+            (json!({"topic": "weather", "rate_hz": 1}), "weather"),
+            (json!({"topic": "status"}), "rate_hz"),
+            (json!({"topic": "status", "rate_hz": -1}), "rate_hz is -1"),
+            (json!({"topic": "status", "rate_hz": 101}), "rate_hz is 101"),
+            (json!({"topic": "status", "rate_hz": 1, "size_px": [9, 9]}), "live_images"),
+            (json!({"topic": "live_images", "rate_hz": 1, "size_px": [9, 100]}), "16"),
+            (json!({"topic": "live_images", "rate_hz": 1, "colour": true}), "colour"),
+        ] {
+            let error = apply(&mut subscriptions, message.clone()).expect_err("invalid");
+            assert!(error.contains(named), "{message}: {error}");
+        }
+        assert_eq!(subscriptions, Subscriptions::default());
+        let of_camera = |ix: usize| json!({"topic": "live_images", "rate_hz": 1, "camera": ix.to_string()});
+        for ix in 0..MAX_CAMERAS {
+            apply(&mut subscriptions, of_camera(ix)).expect("valid");
+        }
+        assert!(apply(&mut subscriptions, of_camera(MAX_CAMERAS)).expect_err("too many").contains("64"));
+        apply(&mut subscriptions, of_camera(0)).expect("a known camera can be changed");
+    }
+
+    #[test]
+    fn images_keep_their_aspect_ratio_and_are_never_enlarged() {
+        for (size_px, max_px, expected) in [
+            ([1280, 720], [640, u32::MAX], [640, 360]),
+            ([640, 480], [240, 240], [240, 180]),
+            ([480, 640], [240, 240], [180, 240]),
+            ([320, 240], [640, u32::MAX], [320, 240]),
+            ([4000, 1], [640, u32::MAX], [640, 1]),
+        ] {
+            assert_eq!(fitted(size_px, max_px), expected);
+        }
+    }
+}

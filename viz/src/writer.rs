@@ -1,0 +1,331 @@
+//! Sends data to one client, the most urgent first.
+//!
+//! Long messages are sent in parts if the client can join them, so that urgent messages wait for at most one part. The
+//! parts and the kernel's buffer are so small that their transfer takes less than 100 ms. Everything else waits here,
+//! where newer data replaces older data.
+
+use crate::admission::Connection;
+use crate::client_updates::{ClientUpdates, Next};
+use crate::hub::Demand;
+use crate::link_rate::LinkRate;
+use crate::negotiation::{Agreement, CAPABILITIES, Negotiated};
+use crate::picture::{PackError, pack_picture};
+use crate::protocol::{BASE_PROTOCOL_VERSION, PROTOCOL_VERSION};
+use crate::queue::{Outgoing, RenderJob};
+use crate::robot::RobotStateMessage;
+use crate::server_context::ServerContext;
+use crate::server_message::{BinaryHeader, PartHeader, PictureHeader, ServerMessage, frame};
+use crate::view_request::{DEFAULT_STAGES, MAX_SIZE_PX};
+use axum::body::Bytes;
+use axum::extract::ws::{Message, WebSocket};
+use futures_util::SinkExt;
+use futures_util::stream::SplitSink;
+use std::ops::ControlFlow;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+use tokio::sync::{Notify, mpsc, watch};
+use tokio::task::{JoinError, JoinHandle};
+use tokio::time::MissedTickBehavior;
+use trainer::Rendered;
+
+/// Period of heartbeats; short enough for pages to detect silence quickly.
+const HEARTBEAT_PERIOD: Duration = Duration::from_millis(250);
+/// Period of WebSocket pings. The next one is sent only if the last one was answered.
+const PING_PERIOD: Duration = Duration::from_secs(1);
+/// Pictures take precedence over live images and keyframe lists, but delay them by at most this time.
+const MAX_UPDATE_DELAY: Duration = Duration::from_millis(500);
+/// A client with the capability `heartbeat` that has been silent for longer gets no pictures, images and robot states:
+/// they would be outdated when the connection works again.
+const MAX_SILENCE: Duration = Duration::from_secs(2);
+
+/// A message that the reader asks the writer to send.
+pub(crate) enum Reply {
+    Welcome(Agreement),
+    Error { id: Option<u64>, message: String },
+    Pong { t: f64 },
+    Goodbye { reason: String },
+}
+
+/// Control flow of a session: continue or end.
+pub(crate) type SessionFlow = ControlFlow<()>;
+
+/// The sending half of a session.
+pub(crate) struct Writer<'a> {
+    pub(crate) sink: SplitSink<WebSocket, Message>,
+    pub(crate) server_context: &'a ServerContext,
+    pub(crate) client: u64,
+    pub(crate) connection: &'a Connection,
+    pub(crate) negotiated: Negotiated,
+    pub(crate) link: LinkRate,
+    /// When the last part was sent.
+    pub(crate) part_sent: Instant,
+}
+
+/// A picture being encoded.
+struct EncodingTask {
+    id: u64,
+    view: Arc<str>,
+    task: JoinHandle<Result<Vec<u8>, PackError>>,
+}
+
+/// A binary message that is being sent in parts.
+struct Transfer {
+    number: u64,
+    bytes: Bytes,
+    n_sent: usize,
+    is_picture: bool,
+}
+
+/// An encoded picture, or the reason why there is none.
+type EncodingResult = Result<Result<Vec<u8>, PackError>, JoinError>;
+
+impl Writer<'_> {
+    /// Sends until the connection fails or a goodbye is sent.
+    ///
+    /// Order: replies, robot states, heartbeats, short updates, pictures, live images, keyframe lists.
+    pub(crate) async fn run(
+        mut self,
+        wake: &Notify,
+        mut replies: mpsc::Receiver<Reply>,
+        mut demand: watch::Receiver<Demand>,
+    ) -> SessionFlow {
+        let mut stopped = self.server_context.stopped.clone();
+        let mut latest_messages = self.server_context.latest_messages.clone();
+        let mut robot_state = self.server_context.hub.robot_state();
+        robot_state.mark_changed();
+        let mut robot_state_sent: Option<Instant> = None;
+        let mut updates = ClientUpdates::default();
+        let mut long_update_sent = Instant::now();
+        let mut waiting_update: Option<(Message, bool)> = None;
+        let mut encoding: Option<EncodingTask> = None;
+        let mut transfer: Option<Transfer> = None;
+        let mut n_transfers = 0;
+        let mut start_transfer = |bytes: Bytes, is_picture| {
+            n_transfers += 1;
+            Some(Transfer { number: n_transfers, bytes, n_sent: 0, is_picture })
+        };
+        let mut heartbeat = tokio::time::interval(HEARTBEAT_PERIOD);
+        let mut ping = tokio::time::interval(PING_PERIOD);
+        heartbeat.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        ping.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        self.send_hello().await?;
+        loop {
+            let is_heard = !self.negotiated.has_heartbeat || self.connection.silence() <= MAX_SILENCE;
+            if encoding.is_none()
+                && is_heard
+                && let Some(outgoing) = self.server_context.hub.collect(self.client)
+            {
+                match outgoing {
+                    Outgoing::Picture(rendered) => encoding = Some(encode(rendered)),
+                    Outgoing::Failed { id, view, reason } => {
+                        let sent = self.send_error(Some(id), &view, &reason).await;
+                        self.server_context.hub.release(self.client);
+                        sent?;
+                        continue;
+                    }
+                }
+            }
+            let subscriptions = Arc::clone(&demand.borrow_and_update().subscriptions);
+            let mut update_due = None;
+            let allows_long =
+                is_heard && transfer.is_none() && (encoding.is_none() || long_update_sent.elapsed() > MAX_UPDATE_DELAY);
+            if waiting_update.is_none() {
+                let latest = latest_messages.borrow_and_update();
+                let has_changes = self.negotiated.has_keyframe_changes;
+                match updates.next(&latest, &subscriptions, has_changes, Instant::now(), allows_long) {
+                    Next::Short(message) => waiting_update = Some((message, false)),
+                    Next::Long(message) => waiting_update = Some((message, true)),
+                    Next::WaitUntil(time) => update_due = Some(time),
+                    Next::Wait => {}
+                }
+            }
+            let state_due = subscriptions
+                .robot_state
+                .filter(|_| is_heard)
+                .map(|period| robot_state_sent.and_then(|sent| sent.checked_add(period)).unwrap_or_else(Instant::now));
+            let is_waiting_long = waiting_update.as_ref().map(|(_, is_long)| *is_long);
+            tokio::select! {
+                biased;
+                _ = stopped.changed() => return self.send_goodbye_when_stopped().await,
+                Some(reply) = replies.recv() => self.reply(reply).await?,
+                () = changed_after(&mut robot_state, state_due) => {
+                    robot_state_sent = Some(Instant::now());
+                    let state = robot_state.borrow_and_update().clone();
+                    if let Some(state) = state {
+                        let message = RobotStateMessage::new(&state, self.server_context.clock);
+                        self.send_message(&ServerMessage::RobotState(message)).await?;
+                    }
+                }
+                _ = heartbeat.tick() => {
+                    let clock_millis = self.server_context.clock.now_millis();
+                    self.send_message(&ServerMessage::Heartbeat { clock_millis }).await?;
+                }
+                _ = ping.tick() => if self.connection.start_ping() {
+                    self.send(Message::Ping(Default::default())).await?;
+                },
+                () = std::future::ready(()), if is_waiting_long == Some(false) => {
+                    if let Some((message, _)) = waiting_update.take() {
+                        self.send(message).await?;
+                    }
+                }
+                () = std::future::ready(()), if transfer.is_some() && is_heard => {
+                    if let Some(mut current) = transfer.take() {
+                        let sent = self.send_part(&mut current).await;
+                        let is_complete = current.n_sent == current.bytes.len();
+                        if current.is_picture && (is_complete || sent.is_break()) {
+                            self.server_context.hub.release(self.client);
+                        }
+                        sent?;
+                        transfer = (!is_complete).then_some(current);
+                    }
+                }
+                () = std::future::ready(()), if is_waiting_long == Some(true) && transfer.is_none() => {
+                    long_update_sent = Instant::now();
+                    match waiting_update.take() {
+                        Some((Message::Binary(bytes), _)) => transfer = start_transfer(bytes, false),
+                        Some((message, _)) => self.send(message).await?,
+                        None => {}
+                    }
+                }
+                encoded = finished(&mut encoding), if transfer.is_none() => {
+                    let Some(EncodingTask { id, view, .. }) = encoding.take() else { continue };
+                    let reason = match encoded {
+                        Ok(Ok(bytes)) => {
+                            transfer = start_transfer(bytes.into(), true);
+                            continue;
+                        }
+                        Ok(Err(error)) => error.to_string(),
+                        Err(error) => error.to_string(),
+                    };
+                    let sent = self.send_error(Some(id), &view, &reason).await;
+                    self.server_context.hub.release(self.client);
+                    sent?;
+                }
+                () = wake.notified(), if encoding.is_none() => {}
+                _ = latest_messages.changed(), if waiting_update.is_none() => {}
+                _ = demand.changed() => {}
+                () = sleep_until(update_due) => {}
+            }
+        }
+    }
+
+    async fn send_hello(&mut self) -> SessionFlow {
+        let hello = ServerMessage::Hello {
+            protocol: BASE_PROTOCOL_VERSION,
+            protocols: [BASE_PROTOCOL_VERSION, PROTOCOL_VERSION],
+            capabilities: &CAPABILITIES,
+            server: concat!("fieldrig ", env!("CARGO_PKG_VERSION")),
+            client: self.client,
+            max_size_px: [MAX_SIZE_PX; 2],
+            default_stages: &DEFAULT_STAGES,
+            clock_millis: self.server_context.clock.now_millis(),
+        };
+        self.send_message(&hello).await
+    }
+
+    async fn reply(&mut self, reply: Reply) -> SessionFlow {
+        match reply {
+            Reply::Welcome(Agreement { protocol, names, negotiated }) => {
+                self.negotiated = negotiated;
+                self.send_message(&ServerMessage::Welcome { protocol, capabilities: names }).await
+            }
+            Reply::Error { id, message } => self.send_error(id, "", &message).await,
+            Reply::Pong { t } => {
+                let clock_millis = self.server_context.clock.now_millis();
+                self.send_message(&ServerMessage::Pong { t, clock_millis }).await
+            }
+            Reply::Goodbye { reason } => self.send_goodbye(&reason).await,
+        }
+    }
+
+    /// Sends the next part, or the whole message if the client cannot join parts.
+    async fn send_part(&mut self, transfer: &mut Transfer) -> SessionFlow {
+        let n_bytes = transfer.bytes.len();
+        let n_part = if self.negotiated.has_parts { self.link.part_bytes() } else { usize::MAX };
+        let begin = transfer.n_sent;
+        let end = n_bytes.min(begin.saturating_add(n_part));
+        let message = if begin == 0 && end == n_bytes {
+            Message::Binary(transfer.bytes.clone())
+        } else {
+            let header = PartHeader { message: transfer.number, offset: begin, bytes: n_bytes };
+            Message::binary(frame(&BinaryHeader::Part(header), &[&transfer.bytes[begin..end]]))
+        };
+        let began = Instant::now();
+        let pause = began - self.part_sent;
+        self.send(message).await?;
+        self.part_sent = Instant::now();
+        self.link.observe(end - begin, self.part_sent - began, pause);
+        self.connection.set_send_buffer(self.link.buffer_bytes());
+        transfer.n_sent = end;
+        ControlFlow::Continue(())
+    }
+
+    /// Sends the last status, which contains the result of the run, then a goodbye.
+    async fn send_goodbye_when_stopped(&mut self) -> SessionFlow {
+        let latest = self.server_context.hub.status().borrow().clone();
+        if let Some(status) = latest {
+            self.send_message(&ServerMessage::Status(&status)).await?;
+        }
+        self.send_goodbye("the server has stopped").await
+    }
+
+    async fn send_error(&mut self, id: Option<u64>, view: &str, message: &str) -> SessionFlow {
+        let view = (!view.is_empty()).then_some(view);
+        self.send_message(&ServerMessage::Error { id, view, message }).await
+    }
+
+    async fn send_goodbye(&mut self, reason: &str) -> SessionFlow {
+        self.send_message(&ServerMessage::Goodbye { reason }).await?;
+        self.send(Message::Close(None)).await?;
+        ControlFlow::Break(())
+    }
+
+    async fn send_message(&mut self, message: &ServerMessage<'_>) -> SessionFlow {
+        self.send(Message::text(message.to_json())).await
+    }
+
+    async fn send(&mut self, message: Message) -> SessionFlow {
+        match self.sink.send(message).await {
+            Ok(()) => ControlFlow::Continue(()),
+            Err(error) => {
+                log::debug!("client {}: {error}", self.client);
+                ControlFlow::Break(())
+            }
+        }
+    }
+}
+
+fn encode(rendered: Box<(RenderJob, PictureHeader, Rendered)>) -> EncodingTask {
+    let view_request = &rendered.0.view_request;
+    let (id, view) = (view_request.id, Arc::clone(&view_request.view));
+    let task = tokio::task::spawn_blocking(move || {
+        let (job, header, picture) = *rendered;
+        pack_picture(&job.view_request, header, &picture)
+    });
+    EncodingTask { id, view, task }
+}
+
+/// Waits until the current picture is encoded. Without one, waits forever.
+async fn finished(encoding: &mut Option<EncodingTask>) -> EncodingResult {
+    match encoding {
+        Some(encoding) => (&mut encoding.task).await,
+        None => std::future::pending().await,
+    }
+}
+
+/// Waits until this time; forever without one.
+async fn sleep_until(time: Option<Instant>) {
+    match time {
+        Some(time) => tokio::time::sleep_until(time.into()).await,
+        None => std::future::pending().await,
+    }
+}
+
+/// Waits until this time, then for a value that has not been read; forever without a time.
+async fn changed_after<T>(receiver: &mut watch::Receiver<T>, time: Option<Instant>) {
+    sleep_until(time).await;
+    if receiver.changed().await.is_err() {
+        // The server is about to stop.
+        std::future::pending::<()>().await;
+    }
+}

@@ -1,0 +1,294 @@
+//! Opens the bundled page in a real browser, compares the silhouette of the robot with the exact one, in front of the
+//! scene and partly behind it, and uses the controls of the view.
+//!
+//! Skipped, with a message, if Chromium or the bundle (`make web`) is missing.
+
+mod analytic_scene;
+mod browser;
+mod robot;
+
+use analytic_scene::{draw, looking_along_y, ray_in_world};
+use browser::{Browser, chromium};
+use kinematics::Chain;
+use nalgebra::{Point3, Translation3, Vector3};
+use std::path::PathBuf;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
+use trainer::{Projection, RenderRequest};
+use viz::{Hub, RobotState, SceneHint, Server, ServerConfig};
+
+const WINDOW_PX: [u32; 2] = [1280, 760];
+/// Required overlap of the drawn silhouette with the exact one: intersection over union.
+const MIN_IOU: f64 = 0.97;
+/// Far more than two busy cores need to draw the page in software.
+const TIMEOUT: Duration = Duration::from_secs(60);
+/// Part of the view that nothing else covers: distance from its top and bottom edges, pixels.
+const MARGIN_PX: u32 = 60;
+
+/// Draws pictures and moves the robot on separate threads, like a run.
+struct Run {
+    angle: Arc<Mutex<f64>>,
+    base_x: Arc<Mutex<f64>>,
+    requests: Arc<Mutex<Vec<RenderRequest>>>,
+    stop: Arc<AtomicBool>,
+    threads: Vec<std::thread::JoinHandle<()>>,
+}
+
+impl Run {
+    fn start(hub: &Hub) -> Self {
+        let angle: Arc<Mutex<f64>> = Arc::default();
+        let requests: Arc<Mutex<Vec<RenderRequest>>> = Arc::default();
+        let stop: Arc<AtomicBool> = Arc::default();
+        let renderer = {
+            let (hub, requests, stop) = (hub.clone(), Arc::clone(&requests), Arc::clone(&stop));
+            std::thread::spawn(move || {
+                while !stop.load(Ordering::Relaxed) {
+                    hub.wait_for_request(Duration::from_millis(50));
+                    if let Some(pending) = hub.next_request() {
+                        requests.lock().expect("no panic").push(pending.request.clone());
+                        let picture = draw(&pending.request);
+                        pending.deliver(picture);
+                    }
+                }
+            })
+        };
+        let base_x: Arc<Mutex<f64>> = Arc::default();
+        let arm = {
+            let (hub, stop) = (hub.clone(), Arc::clone(&stop));
+            let (angle, base_x) = (Arc::clone(&angle), Arc::clone(&base_x));
+            std::thread::spawn(move || {
+                while !stop.load(Ordering::Relaxed) {
+                    let mut state = robot::state(*angle.lock().expect("no panic"));
+                    let moved = Translation3::new(*base_x.lock().expect("no panic"), 0.0, 0.0);
+                    state.world_from_base = moved * state.world_from_base;
+                    hub.set_robot_state(state);
+                    std::thread::sleep(Duration::from_millis(20));
+                }
+            })
+        };
+        Self { angle, base_x, requests, stop, threads: vec![renderer, arm] }
+    }
+
+    /// Moves the base along x.
+    fn move_base(&self, x: f64) {
+        *self.base_x.lock().expect("no panic") = x;
+    }
+
+    fn turn_to(&self, angle: f64) {
+        *self.angle.lock().expect("no panic") = angle;
+    }
+
+    fn last_request(&self) -> RenderRequest {
+        self.requests.lock().expect("no panic").last().expect("a picture was requested").clone()
+    }
+}
+
+impl Drop for Run {
+    fn drop(&mut self) {
+        self.stop.store(true, Ordering::Relaxed);
+        for thread in self.threads.drain(..) {
+            assert!(thread.join().is_ok() || std::thread::panicking(), "a thread of the run panicked");
+        }
+    }
+}
+
+/// Where the robot is visible, by pixel.
+fn exact_silhouette(request: &RenderRequest, state: &RobotState, is_occluded: bool) -> Vec<bool> {
+    let (scene, shapes) = (draw(request), robot::PosedShapes::new(state));
+    let [width, height] = request.size_px;
+    let pixels = (0..height).flat_map(|y| (0..width).map(move |x| (x, y)));
+    let depths = scene.depth_m.iter().map(|depth| if *depth > 0.0 { f64::from(*depth) } else { f64::INFINITY });
+    pixels
+        .zip(depths)
+        .map(|((x, y), scene_depth)| {
+            let (eye, direction) = ray_in_world(request, f64::from(x) + 0.5, f64::from(y) + 0.5);
+            let depth = shapes.nearest_hit(eye, direction);
+            depth.is_some_and(|depth| !is_occluded || depth < scene_depth)
+        })
+        .collect()
+}
+
+/// Where the screenshot has the robot's yellow, which nothing else in the scene has.
+fn drawn_silhouette(shot: &image::RgbImage) -> Vec<bool> {
+    let is_yellow = |pixel: &image::Rgb<u8>| {
+        let [red, green, blue] = pixel.0.map(f64::from);
+        red > 40.0 && green > 0.6 * red && red > 0.7 * green && blue < 0.5 * green
+    };
+    shot.pixels().map(is_yellow).collect()
+}
+
+fn iou(request: &RenderRequest, a: &[bool], b: &[bool]) -> f64 {
+    let [width, height] = request.size_px;
+    let rows = (MARGIN_PX * width) as usize..((height - MARGIN_PX) * width) as usize;
+    let pairs = || a[rows.clone()].iter().zip(&b[rows.clone()]);
+    let n_both = pairs().filter(|(a, b)| **a && **b).count();
+    let n_any = pairs().filter(|(a, b)| **a || **b).count();
+    assert!(n_any > 5000, "the robot covers only {n_any} pixels");
+    n_both as f64 / n_any as f64
+}
+
+#[test]
+fn robot_silhouette_is_exact_in_front_and_behind() {
+    let bundle = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("web/dist/app.js");
+    let Some(program) = chromium().filter(|_| bundle.is_file()) else {
+        eprintln!("page test skipped: it needs Chromium and the bundled page (make web)");
+        return;
+    };
+    let hub = Hub::new();
+    hub.set_scene_hint(SceneHint {
+        center_m: [0.0, 0.0, 0.2],
+        radius_m: 0.8,
+        world_from_camera: Translation3::new(0.0, 0.0, 0.3) * looking_along_y(),
+    });
+    hub.set_robot(robot::description());
+    let server = Server::start(ServerConfig { listen: ([127, 0, 0, 1], 0).into() }, hub.clone()).expect("a free port");
+    let run = Run::start(&hub);
+    let scratch = PathBuf::from(env!("CARGO_TARGET_TMPDIR"));
+    let profile = scratch.join(format!("chromium-robot-{}", std::process::id()));
+    let mut browser = Browser::open(&program, &profile, &server.url(), WINDOW_PX);
+    wait_for(&mut browser, "a full picture", |browser| browser.text("picture-text").contains("100 %"));
+    browser.click("toggle-grid");
+    let request = run.last_request();
+
+    let mut masks = Vec::new();
+    for angle in [0.0, 0.9] {
+        run.turn_to(angle);
+        std::thread::sleep(Duration::from_millis(500));
+        for is_occluded in [true, false] {
+            let shot = canvas_shot(&mut browser);
+            let name = format!("page-robot-{angle}-{}.png", if is_occluded { "occluded" } else { "in-front" });
+            shot.save(scratch.join(name)).expect("written");
+            assert_eq!([shot.width(), shot.height()], request.size_px);
+            let exact = exact_silhouette(&request, &robot::state(angle), is_occluded);
+            let overlap = iou(&request, &drawn_silhouette(&shot), &exact);
+            assert!(overlap >= MIN_IOU, "angle {angle}, occluded {is_occluded}: IoU {overlap}");
+            masks.push(exact);
+            browser.click("toggle-occlude");
+        }
+    }
+    // The cases differ, so that a wrong case would have been detected.
+    for (a, b) in [(0, 1), (0, 2), (2, 3)] {
+        let similarity = iou(&request, &masks[a], &masks[b]);
+        assert!(similarity < MIN_IOU - 0.02, "cases {a} and {b} are too similar: {similarity}");
+    }
+    assert_eq!(browser.evaluate("document.getElementById('robot-age').hidden"), true, "the pose is live");
+    check_pivot(&mut browser, &run);
+    check_views(&mut browser, &run);
+    check_crop(&mut browser, &run);
+    check_follow(&mut browser, &run);
+    drop(run);
+    wait_for(&mut browser, "an outdated pose", |browser| browser.text("robot-age").contains("s old"));
+    drop(browser);
+    std::fs::remove_dir_all(&profile).expect("the browser has left its profile");
+}
+
+/// A double click turns the view toward the surface at that pixel.
+fn check_pivot(browser: &mut Browser, run: &Run) {
+    let before = run.last_request();
+    let [x, y] = [before.size_px[0] / 2 - 150, before.size_px[1] / 2 + 250];
+    let ix = (y * before.size_px[0] + x) as usize;
+    let depth = f64::from(draw(&before).depth_m[ix]);
+    assert!(depth > 0.0, "there is a surface");
+    let (eye, direction) = ray_in_world(&before, f64::from(x) + 0.5, f64::from(y) + 0.5);
+    let surface = eye + direction * depth;
+    let [left, top] = canvas_origin(browser);
+    browser.evaluate(&format!(
+        "document.getElementById('canvas').dispatchEvent(new MouseEvent('dblclick', {{clientX: {}, clientY: {}}}))",
+        left + x,
+        top + y
+    ));
+    wait_for(browser, "a view toward the surface", |_| {
+        let in_camera = run.last_request().world_from_camera.inverse_transform_point(&surface);
+        in_camera.z > 0.0 && in_camera.coords.xy().norm() < 0.02 * in_camera.z
+    });
+}
+
+/// The buttons for the views from above and from the front.
+fn check_views(browser: &mut Browser, run: &Run) {
+    for (button, forward) in [("look-top", -Vector3::z()), ("look-front", Vector3::y())] {
+        browser.click(button);
+        wait_for(browser, button, |_| {
+            (run.last_request().world_from_camera.rotation * Vector3::z() - forward).norm() < 0.01
+        });
+    }
+}
+
+/// The crop box encloses the scene; dragging a handle moves one side and not the view.
+fn check_crop(browser: &mut Browser, run: &Run) {
+    assert_eq!(run.last_request().crop, None);
+    browser.click("toggle-crop");
+    wait_for(browser, "a cropped picture", |_| run.last_request().crop.is_some());
+    wait_for(browser, "a full picture", |browser| browser.text("picture-text").contains("100 %"));
+    let before = run.last_request();
+    let crop = before.crop.expect("a crop");
+    let expected = [[-0.48, -0.48, -0.28], [0.48, 0.48, 0.68]]; // 1.2 times the radius, around the center.
+    for (corner, expected) in [crop.min_m, crop.max_m].iter().zip(expected) {
+        assert!(corner.iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-6), "{crop:?}");
+    }
+    let Projection::Pinhole { focal_px, principal_px } = before.projection else { panic!("a pinhole") };
+    let in_camera = before.world_from_camera.inverse_transform_point(&Point3::new(0.48, 0.0, 0.2));
+    let at = |axis: usize| focal_px[axis] * in_camera[axis] / in_camera.z + principal_px[axis];
+    let [left, top] = canvas_origin(browser);
+    #[expect(clippy::cast_possible_truncation, reason = "pixels of a window")]
+    let handle = [at(0) as i32 + left.cast_signed(), at(1) as i32 + top.cast_signed()];
+    browser.mouse("mousePressed", handle);
+    for step in 1..=8 {
+        browser.mouse("mouseMoved", [handle[0] - 10 * step, handle[1]]);
+    }
+    browser.mouse("mouseReleased", [handle[0] - 80, handle[1]]);
+    // 80 pixels at the depth of the handle.
+    let expected_x = 0.48 - 80.0 * in_camera.z / focal_px[0];
+    wait_for(browser, "a smaller box", |_| {
+        run.last_request().crop.is_some_and(|crop| (crop.max_m[0] - expected_x).abs() < 0.02)
+    });
+    let after = run.last_request();
+    assert_eq!(after.crop.map(|crop| (crop.min_m, crop.max_m[1])), Some((crop.min_m, crop.max_m[1])));
+    let motion = before.world_from_camera.inverse() * after.world_from_camera;
+    assert!(motion.translation.vector.norm() < 1e-6, "the view has not moved");
+    browser.click("toggle-crop");
+    wait_for(browser, "the whole scene", |_| run.last_request().crop.is_none());
+}
+
+/// The view follows the arm.
+fn check_follow(browser: &mut Browser, run: &Run) {
+    let tip = |angle: f64| {
+        let chain = Chain::from_urdf(robot::URDF, "pedestal", "arm").expect("a chain");
+        (robot::state(angle).world_from_base * chain.forward(&[angle]).expect("a pose")).translation.vector
+    };
+    // The last joint turns the arm about its own axis, so that the origin of its link stays.
+    assert!((tip(0.9) - tip(0.2)).norm() < 1e-9);
+    let before = run.last_request().world_from_camera.translation.vector;
+    browser.click("toggle-follow");
+    run.turn_to(0.2);
+    std::thread::sleep(Duration::from_millis(300));
+    run.move_base(0.25);
+    wait_for(browser, "a view that has moved with the base", |_| {
+        let moved = run.last_request().world_from_camera.translation.vector - before;
+        (moved - Vector3::new(0.25, 0.0, 0.0)).norm() < 1e-3
+    });
+}
+
+/// Position of the view in the window.
+fn canvas_origin(browser: &mut Browser) -> [u32; 2] {
+    let script = "(() => { const b = document.getElementById('canvas').getBoundingClientRect(); return [b.x, b.y].map(Math.round) })()";
+    let bounds = browser.evaluate(script);
+    [0, 1].map(|ix| bounds[ix].as_u64().and_then(|n| u32::try_from(n).ok()).expect("a position"))
+}
+
+fn wait_for(browser: &mut Browser, what: &str, mut is_there: impl FnMut(&mut Browser) -> bool) {
+    let started = Instant::now();
+    while !is_there(browser) {
+        assert!(started.elapsed() < TIMEOUT, "timed out waiting for {what}");
+        std::thread::sleep(Duration::from_millis(50));
+    }
+}
+
+/// The part of the window that the view covers.
+fn canvas_shot(browser: &mut Browser) -> image::RgbImage {
+    browser.next_frame();
+    let bounds = browser.evaluate("(() => { const b = document.getElementById('canvas').getBoundingClientRect(); return [b.x, b.y, b.width, b.height].map(Math.round) })()");
+    let bound = |ix: usize| bounds[ix].as_u64().and_then(|n| u32::try_from(n).ok()).expect("a bound");
+    let shot = image::load_from_memory_with_format(&browser.screenshot(), image::ImageFormat::Png).expect("a PNG");
+    shot.crop_imm(bound(0), bound(1), bound(2), bound(3)).to_rgb8()
+}

@@ -1,0 +1,29 @@
+// The list of keys, made from the titles of the buttons.
+
+import { element } from "./element";
+
+export function setUpHelp(): void {
+  const dialog = element("help", HTMLDialogElement);
+  const show = (): void => {
+    const rows = [...document.querySelectorAll<HTMLButtonElement>(".toolbar button")].flatMap((button) => {
+      const match = /^(.*?) \((.)\)(.*)$/.exec(button.title);
+      return match && !button.hidden ? [row(match[2]!, match[1]! + match[3]!)] : [];
+    });
+    element("keys").replaceChildren(...rows.flat());
+    if (dialog.open) dialog.close();
+    else dialog.showModal();
+  };
+  element("show-help").addEventListener("click", show);
+  window.addEventListener("keydown", (event) => {
+    if (event.key === "?") show();
+  });
+  dialog.addEventListener("click", () => dialog.close());
+}
+
+function row(key: string, meaning: string): HTMLElement[] {
+  const term = document.createElement("dt");
+  const details = document.createElement("dd");
+  term.textContent = key;
+  details.textContent = meaning;
+  return [term, details];
+}

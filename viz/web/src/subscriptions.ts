@@ -1,0 +1,82 @@
+// Subscribes to the data that the page shows, at the rates and sizes at which it is shown.
+
+import type { Connection } from "./connection";
+import type { SubscribeMessage } from "./protocol";
+
+const STATUS_HZ = 2;
+const KEYFRAMES_HZ = 2;
+/** An image is labeled live for half a second. */
+const IMAGES_HZ = 4;
+const ROBOT_HZ = 60;
+/** Keyframes whose points are sent per second, 22 kB each. */
+const POINTS_HZ = 20;
+/** Rate of the status, which the title bar needs, while the page is hidden. */
+const HIDDEN_STATUS_HZ = 0.5;
+/** Limits of the height of camera images, in CSS pixels: see `.live canvas` in app.css. */
+const IMAGE_HEIGHT = { min: 90, max: 190, ofWindow: 0.22 };
+const MAX_IMAGE_WIDTH_PX = 640;
+
+export class Subscriptions {
+  private sent = "";
+  private showsPoints = false;
+
+  constructor(private readonly connection: Connection) {
+    document.addEventListener("visibilitychange", () => this.update());
+    window.addEventListener("resize", () => this.update());
+  }
+
+  /** Subscribes anew: a new connection has the server's defaults. */
+  restart(): void {
+    this.sent = "";
+    this.update();
+  }
+
+  /** Whether the points of keyframes are shown. */
+  set points(shown: boolean) {
+    this.showsPoints = shown;
+    this.update();
+  }
+
+  private update(): void {
+    if (!this.connection.isOpen || !this.connection.supports("subscribe")) return;
+    const messages = document.hidden ? this.whileHidden() : this.whileVisible();
+    const key = JSON.stringify(messages);
+    if (key === this.sent) return;
+    this.sent = key;
+    for (const message of messages) this.connection.send(message);
+  }
+
+  private whileVisible(): SubscribeMessage[] {
+    const { min, max, ofWindow } = IMAGE_HEIGHT;
+    const height = Math.min(max, Math.max(min, ofWindow * window.innerHeight)) * Math.min(devicePixelRatio, 2);
+    const messages: SubscribeMessage[] = [
+      { type: "subscribe", topic: "status", rate_hz: STATUS_HZ },
+      { type: "subscribe", topic: "keyframes", rate_hz: KEYFRAMES_HZ },
+      {
+        type: "subscribe",
+        topic: "live_images",
+        rate_hz: IMAGES_HZ,
+        size_px: [MAX_IMAGE_WIDTH_PX, Math.round(height)],
+      },
+    ];
+    if (this.connection.supports("robot")) {
+      messages.push({ type: "subscribe", topic: "robot_state", rate_hz: ROBOT_HZ });
+    }
+    if (this.connection.supports("keyframe_points")) {
+      messages.push({ type: "subscribe", topic: "keyframe_points", rate_hz: this.showsPoints ? POINTS_HZ : 0 });
+    }
+    return messages;
+  }
+
+  private whileHidden(): SubscribeMessage[] {
+    const messages: SubscribeMessage[] = [
+      { type: "subscribe", topic: "status", rate_hz: HIDDEN_STATUS_HZ },
+      { type: "subscribe", topic: "keyframes", rate_hz: 0 },
+      { type: "subscribe", topic: "live_images", rate_hz: 0 },
+    ];
+    for (const [capability, topic] of [["robot", "robot_state"], ["keyframe_points", "keyframe_points"]] as const) {
+      if (this.connection.supports(capability)) messages.push({ type: "subscribe", topic, rate_hz: 0 });
+    }
+    return messages;
+  }
+}

@@ -1,0 +1,47 @@
+// Finds the point of the model's surface on a ray, from the depth of the newest picture.
+
+import { type Matrix4, type Ray, Vector3 } from "three";
+
+/** A depth map and its camera. */
+export interface PosedDepth {
+  worldFromPicture: Matrix4;
+  sizePx: [number, number];
+  focalPx: [number, number];
+  principalPx: [number, number];
+  depth: Float32Array;
+  depthSizePx: [number, number];
+}
+
+const N_STEPS = 400;
+
+/** The first point on the ray that lies behind the surface in the picture's depth map; null if there is none. */
+export function surfacePoint(ray: Ray, posed: PosedDepth, nearM: number, farM: number): Vector3 | null {
+  const pictureFromWorld = posed.worldFromPicture.clone().invert();
+  const point = new Vector3();
+  const inPicture = new Vector3();
+  let before = nearM;
+  for (let step = 1; step <= N_STEPS; step++) {
+    // Steps grow with the distance.
+    const distance = nearM * (farM / nearM) ** (step / N_STEPS);
+    ray.at(distance, point);
+    inPicture.copy(point).applyMatrix4(pictureFromWorld);
+    const surface = depthAt(posed, inPicture);
+    if (surface > 0 && inPicture.z >= surface) {
+      return ray.at(0.5 * (before + distance), point);
+    }
+    before = distance;
+  }
+  return null;
+}
+
+/** Depth of the pixel onto which a point projects; 0 if there is none. */
+function depthAt(posed: PosedDepth, inPicture: Vector3): number {
+  if (inPicture.z <= 0) return 0;
+  const uv = [inPicture.x, inPicture.y].map(
+    (value, axis) =>
+      ((posed.focalPx[axis]! * value) / inPicture.z + posed.principalPx[axis]!) / posed.sizePx[axis]!,
+  );
+  if (uv.some((value) => value < 0 || value >= 1)) return 0;
+  const [x, y] = uv.map((value, axis) => Math.floor(value * posed.depthSizePx[axis]!)) as [number, number];
+  return posed.depth[y * posed.depthSizePx[0] + x] ?? 0;
+}
