@@ -23,7 +23,7 @@ mod jpeg;
 mod keyframe_log;
 mod keyframe_points;
 mod link_rate;
-#[cfg(test)]
+#[cfg(any(test, fuzzing))]
 mod message_checks;
 mod negotiation;
 mod page;
@@ -47,3 +47,9 @@ pub use protocol::{BASE_PROTOCOL_VERSION, PROTOCOL_VERSION};
 pub use robot::{MeshFormat, RobotDescription, RobotMesh, RobotState};
 pub use server::{Server, ServerConfig};
 pub use updates::{KeyframePose, LiveImage, LivePixels, ModelStatus, RunResult, SceneHint, Status};
+
+/// Handles the messages of a client, one per line, and panics if a result is inconsistent.
+#[cfg(fuzzing)]
+pub fn check_session(session: &str) {
+    message_checks::check_session(session);
+}

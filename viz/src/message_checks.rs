@@ -1,5 +1,5 @@
 //! Checks the messages of viewers: every accepted request must be safe to render, and every accepted subscription must
-//! keep its limits. The fuzz target `page` includes this file.
+//! keep its limits. The fuzz target `page` calls it.
 
 use crate::negotiation::{CAPABILITIES, negotiate};
 use crate::protocol::{
