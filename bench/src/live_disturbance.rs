@@ -96,10 +96,10 @@ mod tests {
     fn exposure_steps_at_a_time_and_pose_noise_spares_test_images() {
         let exposure = LiveDisturbance { disturbance: Disturbance::Exposure, level: 1.0 };
         let mut change = exposure.keyframe_change(1, 2.0).expect("changes keyframes");
-        let before = keyframe(0.0, Split::Train).rgba_srgb[0];
-        let mut red_at = |secs: f64| change(keyframe(secs, Split::Train)).rgba_srgb[0];
-        let reds = [red_at(0.0), red_at(1.9), red_at(2.1)];
-        assert!(reds[0] < before && reds[1] == reds[0] && reds[2] > before, "{before} {reds:?}");
+        let before = keyframe(0.0, Split::Train).rgba_srgb[1];
+        let mut green_at = |secs: f64| change(keyframe(secs, Split::Train)).rgba_srgb[1];
+        let greens = [green_at(0.0), green_at(1.9), green_at(2.1)];
+        assert!(greens[0] < before && greens[1] == greens[0] && greens[2] > before, "{before} {greens:?}");
 
         let noise = LiveDisturbance { disturbance: Disturbance::PoseNoise, level: 1.0 };
         let mut change = noise.keyframe_change(1, 2.0).expect("changes keyframes");

@@ -306,14 +306,6 @@ impl Live {
         if self.is_render_pending() {
             return Ok(());
         }
-        let before = Instant::now();
-        self.train_slice()?;
-        self.budget.add_training(before.elapsed());
-        Ok(())
-    }
-
-    /// Trains one model for a slice: waits for its previous submit, then submits more steps and returns.
-    fn train_slice(&mut self) -> crate::Result<()> {
         let is_watched = self.hub.n_clients() > 0;
         self.sessions.iter_mut().for_each(|session| session.set_watched(is_watched));
         let is_paced = self.pace != Pace::RealTime && !self.feed.ended();
@@ -322,11 +314,13 @@ impl Live {
             true => due[ix].saturating_sub(session.progress().step),
             false => u64::MAX,
         };
+        let before = Instant::now();
         let step_before = self.sessions[0].progress().step;
         let (hub, budget) = (&self.hub, self.budget);
         time_slices::train_next(&mut self.sessions, max_steps, || {
             budget.may_render() && hub.wait_for_request(Duration::ZERO)
         })?;
+        self.budget.add_training(before.elapsed());
         // Steps before this slice are complete, because at most one submit is in flight.
         self.ledger.completed(step_before);
         Ok(())
@@ -340,7 +334,6 @@ impl Live {
     /// Draws requested pictures as long as training keeps its share of the time.
     fn render(&mut self) -> crate::Result<()> {
         let started = Instant::now();
-        let can_train = self.is_training() && !self.is_idle() && !self.is_scoring();
         if !self.is_training() || self.is_idle() {
             self.budget.refill(); // Training is idle, so drawing does not delay it.
         }
@@ -364,10 +357,9 @@ impl Live {
                     break;
                 }
             }
-            // Steps that are queued behind the pictures keep the GPU busy while the pictures are delivered.
             let is_any_on_gpu =
                 queued.iter().any(|render| render.queued.as_ref().is_ok_and(|queued| !queued.is_ready()));
-            let trained = if can_train && is_any_on_gpu { self.train_slice() } else { Ok(()) };
+            let trained = if is_any_on_gpu { self.queue_steps() } else { Ok(()) };
             let mut began = before;
             for picture in queued {
                 self.deliver(picture, began);
@@ -375,6 +367,17 @@ impl Live {
             }
             self.budget.add_render(before.elapsed());
             trained?;
+        }
+        Ok(())
+    }
+
+    /// Queues steps behind pictures, which keeps the GPU busy while the pictures are delivered. Only for a single model in
+    /// real time, where this needs no other work.
+    fn queue_steps(&mut self) -> crate::Result<()> {
+        let is_training = self.is_training() && !self.is_idle() && !self.is_scoring();
+        let (Pace::RealTime, [session], true) = (self.pace, &mut self.sessions[..], is_training) else { return Ok(()) };
+        if !session.is_over() {
+            session.train_steps(u64::MAX)?;
         }
         Ok(())
     }

@@ -34,6 +34,9 @@ struct SavedState {
     step: u64,
     model: ModelState,
     n_non_finite: u32,
+    /// Whether memory was too small for more splats.
+    #[serde(default)]
+    is_full: bool,
     /// Training views. Their order determines the training order.
     views: Vec<KeyframeSignature>,
     /// Indices of the views that have not been seeded yet.
@@ -206,6 +209,7 @@ impl SplatTrainer {
             unseeded: self.seeding.unseeded().iter().filter_map(position_of).collect(),
             slots: cameras.slots(),
             remaining_trials: self.trials.remaining_trials(),
+            is_full: self.model.is_full(),
             finished_trials: self.trials.finished.clone(),
             growth_search: self.growth_search.saved(),
             trial: self.trials.running_trial().map(TrialState::of),
@@ -272,6 +276,7 @@ impl SplatTrainer {
         trainer.optimizer.n_non_finite = state.n_non_finite.into();
         trainer.model.cameras.restore(gpu, &state.slots, state.model.params, checkpoint)?;
         trainer.trials.restore(state.remaining_trials, state.finished_trials);
+        trainer.model.set_full(state.is_full);
         trainer.growth_search.restore(state.growth_search);
         if let Some(trial) = state.trial {
             let n_planned_steps = trainer.options.common.n_planned_steps;

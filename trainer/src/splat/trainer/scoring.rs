@@ -13,6 +13,9 @@ use keyframe::Keyframe;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
+/// Number of latest views whose gains are computed when gains are enabled in a live run.
+const MAX_NEW_EXPOSURES: usize = 16;
+
 /// A keyframe and the sums from its comparison with the rendered picture.
 type ScoredKeyframe = (Arc<Keyframe>, [Products; 3]);
 
@@ -71,23 +74,24 @@ impl SplatTrainer {
             variant_db.extend(products::psnr_with_gains(products, gains));
         }
         match self.trials.decide_gains(&baseline_db, &variant_db) {
-            Some(gains) => self.enable_gains(gains, known, mean),
+            Some(gains) => self.enable_gains(gains, known, mean, 0),
             None => Ok(()),
         }
     }
 
-    /// Optimizes image gains from now on. Starts with the gains that best match pictures to images, relative to `mean`;
-    /// those in `known` are already computed.
+    /// Optimizes image gains from now on. From the view `first_ix` on, starts with the gains that best match pictures to
+    /// images, relative to `mean`; those in `known` are already computed.
     fn enable_gains(
         &mut self,
         gains: ParamSet,
         mut known: BTreeMap<usize, [f64; 3]>,
         mean: [f64; 3],
+        first_ix: usize,
     ) -> Result<(), Error> {
         let corrections = self.learned_corrections()?;
         self.model.cameras.enable(gains);
         self.prepare_training()?;
-        self.add_gains(&mut known, (0..self.views.len()).collect(), &corrections)?;
+        self.add_gains(&mut known, (first_ix..self.views.len()).collect(), &corrections)?;
         for (view_ix, gains) in &known {
             let log_gains = [0, 1, 2].map(|color| gains[color] - mean[color]);
             let keyframe = self.views.keyframe(*view_ix);
@@ -97,7 +101,8 @@ impl SplatTrainer {
     }
 
     /// Adds a training keyframe that arrives at the current step. If image gains are watched for or optimized, compares the
-    /// keyframe with the picture before training on it.
+    /// keyframe with the picture before training on it. During a trial, or if memory is too small for the picture, the
+    /// keyframe is added without a comparison.
     pub(super) fn add_live_arrival(&mut self, keyframe: Arc<Keyframe>) -> Result<(), Error> {
         let is_watched = self.trials.watches_gains();
         let is_compared = is_watched || self.model.cameras.set.contains(ParamSet::IMAGE_GAINS);
@@ -108,13 +113,18 @@ impl SplatTrainer {
         let camera = corrected_camera(&self.learned_corrections()?, &keyframe);
         let drawn = DrawnView { splats: &self.model.splats, camera: &camera, background_srgb };
         let rgba = keyframe.rgba_srgb.as_ref();
-        let products = self.renderer.compare_with_upload(&mut self.recorder, drawn, &learn.score, rgba)?;
+        let products = match self.renderer.compare_with_upload(&mut self.recorder, drawn, &learn.score, rgba) {
+            Err(error) if error.is_out_of_memory() => return self.add_arrival(keyframe),
+            products => products?,
+        };
         let log_gains = products::log_gains(&products);
         self.add_arrival(keyframe.clone())?;
         if is_watched {
             let psnr = |gains| products::psnr_with_gains(&products, gains);
             let needed = self.trials.add_arrival_gains(&keyframe, log_gains, psnr);
-            return needed.map_or(Ok(()), |gains| self.enable_gains(gains, BTreeMap::new(), [0.0; 3]));
+            // The model still has the brightness of earlier views.
+            let first_ix = self.views.len().saturating_sub(MAX_NEW_EXPOSURES);
+            return needed.map_or(Ok(()), |gains| self.enable_gains(gains, BTreeMap::new(), [0.0; 3], first_ix));
         }
         self.views.assign_lenses(&self.recorder.gpu, &mut self.model.cameras)?;
         self.model.cameras.initialize_gains(&self.recorder.gpu, &keyframe, log_gains);
