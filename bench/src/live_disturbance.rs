@@ -3,9 +3,9 @@
 use crate::disturb::{Disturbance, expose, exposure_table};
 use capture::Rig;
 use capture::config::TimeOffset;
-use keyframe::Keyframe;
 use kinematics::Stamp;
 use serde::Serialize;
+use session::KeyframeChange;
 use std::fmt;
 use std::sync::Arc;
 
@@ -34,11 +34,7 @@ impl LiveDisturbance {
     /// The change of each keyframe by pose noise or an exposure step. The exposure changes `step_after_secs` after the
     /// first keyframe.
     #[must_use]
-    pub fn keyframe_change(
-        self,
-        seed: u64,
-        step_after_secs: f64,
-    ) -> Option<Box<dyn FnMut(Arc<Keyframe>) -> Arc<Keyframe>>> {
+    pub fn keyframe_change(self, seed: u64, step_after_secs: f64) -> Option<KeyframeChange> {
         match self.disturbance {
             Disturbance::PoseNoise => {
                 Some(Box::new(move |keyframe| self.disturbance.apply(&[keyframe], self.level, seed, 1e9).remove(0)))
@@ -71,7 +67,7 @@ fn serialize_name<S: serde::Serializer>(disturbance: &Disturbance, serializer: S
 #[cfg(test)]
 mod tests {
     use super::*;
-    use keyframe::Split;
+    use keyframe::{Keyframe, Split};
 
     fn keyframe(secs: f64, split: Split) -> Arc<Keyframe> {
         let first = crate::disturb::tests::capture(1).remove(0);
