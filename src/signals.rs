@@ -10,8 +10,6 @@ use session::partial;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 use signal_hook::flag;
 use signal_hook::iterator::Signals;
-use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
 
 /// Shells report this plus the signal number as the exit code of a process that a signal ended.
 const SIGNAL_EXIT_BASE: i32 = 128;
@@ -23,8 +21,7 @@ pub(crate) fn stop_on_signals() -> anyhow::Result<Stop> {
 
 /// As [`stop_on_signals`], for a command that saves nothing.
 pub(crate) fn stop_on_signals_logging(message: &'static str) -> anyhow::Result<Stop> {
-    let (stop, signaled) = Stop::with_signal_flag(message);
-    let interrupted = Arc::new(AtomicBool::new(false));
+    let (stop, [signaled, interrupted]) = Stop::with_signal_flags(message);
     let register = || -> std::io::Result<()> {
         // Actions run in the order of registration, so the first Ctrl-C only sets the flags.
         flag::register_conditional_shutdown(SIGINT, SIGNAL_EXIT_BASE + SIGINT, interrupted.clone())?;

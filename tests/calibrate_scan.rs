@@ -123,6 +123,11 @@ fn arm_moves_around_a_target_until_its_camera_is_calibrated() {
     assert!((10..=20).contains(&n_samples), "{n_samples} poses: {log}");
     assert!(log.contains("finished: the standard deviations are at most"), "{log}");
     assert!(log.contains("returning to the start"), "{log}");
+    // Half the distance to the target, before the first motion.
+    let [distance, motion] = ["; the flange moves at most 0.", "moving to pose 2: orbit the target by 15 degrees"]
+        .map(|text| log.find(text).unwrap_or_else(|| panic!("{text:?} is not in {log}")));
+    assert!(distance < motion, "{log}");
+    assert!(log.contains("relative to pose"), "{log}");
     assert!(is_report_with_photo(folder, "moved.html"));
     let text = std::fs::read_to_string(folder.join("moved.toml")).expect("a rig file");
     assert!(text.contains("[camera.wrist.sim") && !text.contains("lockstep = true"), "{text}");
@@ -220,11 +225,19 @@ fn unusable_scans_are_rejected_with_the_reason() {
         (&["samples.json", "--write-rig", "new.toml"], "name the one to change with --rig"),
         (&["samples.json", "--rig", "rig.toml"], "add --write-rig"),
         (&["rig.toml", "--sim", "--move"], "--target is required with --move"),
-        (&["samples.json", "--move", "--target", TARGET], "--move needs a rig file"),
+        (&["samples.json", "--move", "--target", TARGET], "samples.json is not one"),
         (&["real.toml", "--move", "--enable-motion", "--target", TARGET], "no table [arm.motion]"),
         (&["movable.toml", "--move", "--target", TARGET], "add --enable-motion to confirm"),
         (&["movable.toml", "--move", "--enable-motion", "--target", TARGET], "must both be real or both be simulated"),
-        (&["rig.toml", "--sim", "--move", "--seconds", "9", "--target", TARGET], "use --max-poses"),
+        (
+            &["rig.toml", "--sim", "--move", "--seconds", "9", "--target", TARGET],
+            "limit the number of poses with --max-poses",
+        ),
+        (
+            &["rig.toml", "--sim", "--move", "--target", TARGET, "--urdf", "a.urdf", "--tip", "b"],
+            "names the robot description",
+        ),
+        (&["rig.toml", "--sim", "--move", "--max-poses", "9", "--target", TARGET], "10..=200"),
         (&["rig.toml", "--sim", "--goal-mm", "1", "--target", TARGET], "--move"),
         (&["away.toml", "--sim", "--move", "--target", TARGET], "the target is not visible at the start"),
     ] {

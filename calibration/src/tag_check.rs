@@ -129,7 +129,12 @@ impl TagCheck {
             self.observations.iter().map(|observation| observation.covariance).sum::<Matrix6<f64>>() / n as f64;
         let scatter =
             residuals.iter().map(|residual| residual * residual.transpose()).sum::<Matrix6<f64>>() / (n - 1) as f64;
-        let difference = twist(&mean_in_camera);
+        // A tag that has moved shows in other camera axes at each pose: those of the latest image are used.
+        let latest = self.observations.back()?.calibrated;
+        let difference = match squares_of_camera <= squares_of_world {
+            true => twist(&mean_in_camera),
+            false => twist(&(latest.inverse() * mean_in_world * latest)),
+        };
         let mean_covariance = (scatter + stated) / n as f64;
         let with_sigma = |first: usize| {
             let part = difference.fixed_rows::<3>(first).into_owned();
@@ -277,6 +282,35 @@ mod tests {
         // A robot that stands still sees no difference.
         let (_, found) = run(100, false, |calibrated| moved * calibrated).expect("a contradiction");
         assert_eq!(found.cause, ContradictionCause::Unknown, "{found}");
+    }
+
+    /// In camera axes, the motion of the tag has another direction at each pose, so that its mean is far too small.
+    #[test]
+    fn moved_tag_is_measured_in_the_world_while_the_wrist_rotates() {
+        for moved in [
+            Transform::translation(0.04, 0.0, 0.0),
+            Transform::new(Vector3::new(0.0, 0.04, 0.0), Vector3::new(0.0, 0.0, 0.02)),
+        ] {
+            let mut check = TagCheck::new("wrist");
+            let angles = [-90.0_f64, 90.0].into_iter().cycle().map(f64::to_radians);
+            let found = angles.take(40).enumerate().find_map(|(ix, angle)| {
+                // Around the viewing direction, straight above the origin of the world.
+                let down = Transform::new(Vector3::new(0.0, 0.0, 0.4), Vector3::x() * std::f64::consts::PI);
+                let calibrated = down * Transform::new(Vector3::zeros(), Vector3::z() * angle);
+                check.push(TagObservation {
+                    stamp: Stamp(0).plus_secs(3.0 * ix as f64),
+                    calibrated,
+                    seen: moved * calibrated,
+                    covariance: Matrix6::identity() * 1e-7,
+                    tags: vec![7],
+                })
+            });
+            let found = found.expect("the tag has moved by 40 mm");
+            assert_eq!(found.cause, ContradictionCause::Tag, "{found}");
+            assert!((found.rotation_rad[0] - moved.rotation.angle()).abs() < 1e-3, "{found:?}");
+            // The rotation about the origin of the world also shifts the camera, but not from above it.
+            assert!((found.translation_m[0] - 0.04).abs() < 1e-3, "{found:?}");
+        }
     }
 
     #[test]

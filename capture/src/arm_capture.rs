@@ -2,15 +2,16 @@
 
 use crate::calibration_images::{ArmDuringImage, CalibrationImage, gray_of};
 use crate::config::{Camera, Rig};
+use crate::error::Context;
 use crate::open::{Movable, chain_of};
 use crate::stop::Stop;
 use crate::supervised_arm::SupervisedArm;
 use drivers::Image;
 use drivers::motion::JointTarget;
 use keyframe::bail;
-use kinematics::{Chain, JointState, Stamp};
+use kinematics::{Chain, JointState, Stamp, Transform};
 use std::collections::VecDeque;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 /// Largest change of a joint in one step, radians or meters.
 const MAX_STEP: f64 = 0.25;
@@ -21,12 +22,41 @@ const SETTLE_SECS: f64 = 0.3;
 const MAX_DRIFT: f64 = 3e-4;
 /// Maximum time until the arm stands still and an image arrives.
 const MAX_WAIT_SECS: f64 = 15.0;
-/// Largest distance of a joint from its target after a motion, radians or meters. Arms without gravity compensation sag.
+/// Largest distance of a joint from its target after a motion, and largest correction of its sag, radians or meters. Arms
+/// without gravity compensation sag.
 const MAX_ERROR: f64 = 0.1;
+/// The measured flange may be this much farther from its start than allowed for targets, meters.
+const DISTANCE_TOLERANCE_M: f64 = 0.03;
 /// Duration of one wait for an image.
 const POLL: Duration = Duration::from_millis(20);
-/// Number of joint states kept: those of a second at 1 kHz.
-const MAX_STATES: usize = 1000;
+/// Number of joint states kept: those of four seconds at 1 kHz.
+const MAX_STATES: usize = 4000;
+
+/// The start of a wait for an image.
+struct Wait {
+    began: Stamp,
+    since: Instant,
+}
+
+/// Why the last image was not usable.
+enum Seen {
+    Nothing,
+    Undecodable,
+    /// It was exposed this long before the arm was at rest.
+    Old {
+        secs: f64,
+    },
+    /// Its exposure ends this long after the newest joint state.
+    Early {
+        secs: f64,
+    },
+    FewStates,
+    /// A joint moved by this much.
+    Drift {
+        joint_ix: usize,
+        drift: f64,
+    },
+}
 
 /// A camera and a movable arm.
 pub struct ArmCapture {
@@ -35,6 +65,10 @@ pub struct ArmCapture {
     /// Index in the joint states of each joint of the chain.
     order: Vec<usize>,
     arm: SupervisedArm,
+    /// The last accepted target; before the first, the first state.
+    accepted: Option<Vec<f64>>,
+    /// Pose of the flange from which it may move at most this far, meters.
+    limit: Option<(Transform, f64)>,
     camera: Box<dyn drivers::Camera>,
     recent: VecDeque<JointState>,
     first: Option<Stamp>,
@@ -50,7 +84,20 @@ impl ArmCapture {
         let chain = chain_of(&rig)?;
         let order = chain.order_in(&rig.arm.joints)?;
         let arm = SupervisedArm::new(arm, &rig);
-        Ok(Self { rig, chain, order, arm, camera, recent: VecDeque::new(), first: None })
+        let (accepted, limit, recent, first) = (None, None, VecDeque::new(), None);
+        Ok(Self { rig, chain, order, arm, accepted, limit, camera, recent, first })
+    }
+
+    /// Limits the distance of the flange from where it is now. A motion that exceeds it, for example because the arm sags,
+    /// is reversed.
+    ///
+    /// # Errors
+    /// If the arm has stopped or reports nothing.
+    pub fn limit_distance(&mut self, max_distance_m: f64) -> crate::Result<()> {
+        let joints = self.joints()?;
+        let flange = self.chain.forward(&joints)?;
+        self.limit = Some((flange, max_distance_m));
+        Ok(())
     }
 
     /// The rig, with the calibration that its devices report.
@@ -80,7 +127,8 @@ impl ArmCapture {
     /// still.
     ///
     /// # Errors
-    /// If the arm stops because of a fault, or does not reach a step.
+    /// If the arm stops because of a fault, does not reach a step, or leaves the limit of the distance. In the last two
+    /// cases, it has returned to the previous step, or holds where it is.
     pub fn move_to(&mut self, joints: &[f64], stop: &Stop) -> crate::Result<bool> {
         let from = self.joints()?;
         let largest = from.iter().zip(joints).map(|(from, to)| (to - from).abs()).fold(0.0, f64::max);
@@ -100,27 +148,76 @@ impl ArmCapture {
     }
 
     fn step_to(&mut self, joints: &[f64], stop: &Stop) -> crate::Result<bool> {
-        // Joints that do not move the camera stay where they are.
-        let mut target = JointTarget { position: self.read()?.position };
+        let free = self.read()?.position;
+        // A command to stay here: the previous target, unless someone has moved the arm since then.
+        let accepted = self.accepted.get_or_insert_with(|| free.clone());
+        let sag = accepted.iter().zip(&free).map(|(target, actual)| (target - actual).clamp(-MAX_ERROR, MAX_ERROR));
+        let sag: Vec<f64> = sag.collect();
+        let stay: Vec<f64> = free.iter().zip(&sag).map(|(actual, sag)| actual + sag).collect();
+        // Joints that do not move the camera keep their target.
+        let (mut target, mut expected) = (stay.clone(), free.clone());
         for (value, ix) in joints.iter().zip(&self.order) {
-            target.position[*ix] = *value;
+            target[*ix] = value + sag[*ix];
+            expected[*ix] = *value;
         }
-        let target = self.arm.command(&target)?;
+        let Some(state) = self.go(&target, stop)? else { return Ok(false) };
+        if let Some(problem) = self.problem(&state, &expected)? {
+            let end = self.retreat(&stay, &free, stop).with_context(|| problem.clone())?;
+            bail!("{problem}; {end}");
+        }
+        Ok(true)
+    }
+
+    /// Moves to positions of all joints. Returns the state at the end, or `None` if a stop was requested.
+    fn go(&mut self, position: &[f64], stop: &Stop) -> crate::Result<Option<JointState>> {
+        let accepted = self.arm.command(&JointTarget { position: position.to_vec() })?;
+        self.accepted = Some(accepted.position);
         let recent = &mut self.recent;
         let end = self.arm.follow(stop, |state| remember(recent, state))?;
         if !end.has_arrived {
-            return Ok(false);
+            // The arm holds somewhere on its way.
+            self.accepted = Some(end.state.position);
+            return Ok(None);
         }
-        let errors = end.state.position.iter().zip(&target.position).map(|(actual, target)| (actual - target).abs());
-        let (ix, error) = errors.enumerate().max_by(|a, b| a.1.total_cmp(&b.1)).unwrap_or_default();
-        if error > MAX_ERROR {
+        Ok(Some(end.state))
+    }
+
+    /// Why the arm must not continue from a state. `None` if it is where it should be.
+    fn problem(&self, state: &JointState, expected: &[f64]) -> crate::Result<Option<String>> {
+        if let Some((ix, error)) = largest_error(&state.position, expected)
+            && error > MAX_ERROR
+        {
             let joint = &self.rig.arm.joints[ix];
-            bail!(
+            return Ok(Some(format!(
                 "joint {joint:?} is {error:.3} rad from its target of {:.3} after a motion (at most {MAX_ERROR}); check for an obstacle, or raise its stiffness",
-                target.position[ix]
-            );
+                expected[ix]
+            )));
         }
-        Ok(true)
+        let Some((start, max_m)) = &self.limit else { return Ok(None) };
+        let flange = self.chain.forward(&self.in_chain_order(&state.position))?;
+        let distance_m = (flange.translation.vector - start.translation.vector).norm();
+        Ok((distance_m > max_m + DISTANCE_TOLERANCE_M).then(|| {
+            format!(
+                "the flange is {:.0} mm from its start (at most {:.0} mm) because joints are off their targets; raise their stiffness",
+                1e3 * distance_m,
+                1e3 * max_m
+            )
+        }))
+    }
+
+    /// Ends the push against an obstacle: returns to the previous step, which was free, or holds the arm where it is.
+    ///
+    /// * `stay`: the command of the previous step.
+    /// * `expected`: where it brings the arm.
+    fn retreat(&mut self, stay: &[f64], expected: &[f64], stop: &Stop) -> crate::Result<&'static str> {
+        if let Some(state) = self.go(stay, stop)?
+            && largest_error(&state.position, expected).is_none_or(|(_, error)| error <= MAX_ERROR)
+        {
+            return Ok("the arm has returned to the previous step");
+        }
+        let here = self.read()?.position;
+        self.go(&here, &Stop::default())?;
+        Ok("the arm did not return to the previous step, and holds where it is")
     }
 
     /// Waits until the arm stands still, and returns the next image exposed from then on, with the mean of the joints.
@@ -129,15 +226,19 @@ impl ArmCapture {
     /// # Errors
     /// If a device fails, the arm does not come to rest, or no image can be decoded.
     pub fn image(&mut self, stop: &Stop) -> crate::Result<Option<CalibrationImage>> {
+        self.read_queued()?;
         let began = self.read()?.stamp;
+        let wait = Wait { began, since: Instant::now() };
         self.first.get_or_insert(began);
+        let mut seen = Seen::Nothing;
         loop {
             if stop.requested() {
                 return Ok(None);
             }
             // Notices faults, and ends the wait if no image is usable.
+            self.read_queued()?;
             let now = self.read()?.stamp;
-            self.check_wait(began, now)?;
+            self.check_wait(&wait, now, &seen)?;
             let image = match self.camera.next_image(POLL) {
                 Ok(image) => image,
                 Err(
@@ -149,16 +250,32 @@ impl ArmCapture {
             };
             let [start, end] = self.exposure(&image);
             let settling = start.plus_secs(-SETTLE_SECS);
+            if image.is_depth() {
+                continue;
+            }
             // Queued images may be from before the motion.
-            if image.is_depth() || settling < began {
+            if settling < began {
+                seen = Seen::Old { secs: began.secs_since(start) };
                 continue;
             }
             while self.recent.back().is_none_or(|newest| newest.stamp < end) {
+                if stop.requested() {
+                    return Ok(None);
+                }
                 let now = self.read()?.stamp;
-                self.check_wait(began, now)?;
+                self.check_wait(&wait, now, &Seen::Early { secs: end.secs_since(now) })?;
             }
-            let Some(joints) = self.joints_at_rest(settling, end) else { continue };
-            let Some(gray) = gray_of(&image) else { continue };
+            let joints = match self.joints_at_rest(settling, end) {
+                Ok(joints) => joints,
+                Err(reason) => {
+                    seen = reason;
+                    continue;
+                }
+            };
+            let Some(gray) = gray_of(&image) else {
+                seen = Seen::Undecodable;
+                continue;
+            };
             let pose = self.chain.forward(&joints)?;
             return Ok(Some(CalibrationImage {
                 secs: self.first.map_or(0.0, |first| image.stamp.secs_since(first)),
@@ -169,14 +286,42 @@ impl ArmCapture {
         }
     }
 
-    fn check_wait(&self, began: Stamp, now: Stamp) -> crate::Result<()> {
-        if now.secs_since(began) > MAX_WAIT_SECS {
-            let camera = &self.camera().name;
-            bail!(
-                "camera {camera:?}: no image with the arm at rest within {MAX_WAIT_SECS} s; check that the camera delivers images, and that its stamps and those of the arm are on the same clock"
-            );
+    /// Reads the joint states that have arrived, so that a slow caller does not fall behind. Simulated devices advance only
+    /// when they are read.
+    fn read_queued(&mut self) -> crate::Result<()> {
+        if self.camera.waits_for_caller() {
+            return Ok(());
         }
-        Ok(())
+        let recent = &mut self.recent;
+        self.arm.read_queued(|state| remember(recent, state))
+    }
+
+    fn check_wait(&self, wait: &Wait, now: Stamp, seen: &Seen) -> crate::Result<()> {
+        let secs = match self.camera.waits_for_caller() {
+            true => now.secs_since(wait.began),
+            false => wait.since.elapsed().as_secs_f64(),
+        };
+        if secs <= MAX_WAIT_SECS {
+            return Ok(());
+        }
+        let camera = &self.camera().name;
+        let clocks = "check that the stamps of the camera and of the arm are on the same clock";
+        let reason = match seen {
+            Seen::Nothing => "no image arrived; check that the camera delivers images".to_owned(),
+            Seen::Undecodable => "the images cannot be decoded; choose another pixel format".to_owned(),
+            Seen::Old { secs } => {
+                format!("the last image was exposed {secs:.1} s before the arm came to rest; {clocks}")
+            }
+            Seen::Early { secs } => format!("the last image is {secs:.1} s ahead of the joint states; {clocks}"),
+            Seen::FewStates => {
+                format!("there are too few joint states during the images; check the rate of the arm, and {clocks}")
+            }
+            Seen::Drift { joint_ix, drift } => format!(
+                "joint {:?} drifts by {drift:.5} rad within {SETTLE_SECS} s (at most {MAX_DRIFT}); let the arm hold still, or raise the stiffness",
+                self.rig.arm.joints[*joint_ix]
+            ),
+        };
+        bail!("camera {camera:?}: no image with the arm at rest within {MAX_WAIT_SECS} s: {reason}")
     }
 
     /// Time span in which the rows of an image are exposed.
@@ -189,18 +334,21 @@ impl ArmCapture {
         [mid.plus_secs(-half_secs), mid.plus_secs(half_secs)]
     }
 
-    /// Mean of the joints over a time span, in the order of the chain. `None` if the states do not cover it, or if a joint
+    /// Mean of the joints over a time span, in the order of the chain. An error if the states do not cover it, or if a joint
     /// moves.
-    fn joints_at_rest(&self, start: Stamp, end: Stamp) -> Option<Vec<f64>> {
-        let covers = self.recent.front()?.stamp <= start && self.recent.back()?.stamp >= end;
-        let span: Vec<&JointState> = self.recent.iter().filter(|state| (start..=end).contains(&state.stamp)).collect();
+    fn joints_at_rest(&self, start: Stamp, end: Stamp) -> Result<Vec<f64>, Seen> {
         const MIN_STATES: usize = 4;
+        let [oldest, newest] = [self.recent.front(), self.recent.back()];
+        let covers = oldest.is_some_and(|state| state.stamp <= start) && newest.is_some_and(|state| state.stamp >= end);
+        let span: Vec<&JointState> = self.recent.iter().filter(|state| (start..=end).contains(&state.stamp)).collect();
         if !covers || span.len() < MIN_STATES {
-            return None;
+            return Err(Seen::FewStates);
         }
         let (early, late) = span.split_at(span.len() / 2);
-        let differences = mean(early).into_iter().zip(mean(late)).map(|(early, late)| (early - late).abs());
-        (differences.fold(0.0, f64::max) <= MAX_DRIFT).then(|| self.in_chain_order(&mean(&span)))
+        match largest_error(&mean(early), &mean(late)) {
+            Some((joint_ix, drift)) if drift > MAX_DRIFT => Err(Seen::Drift { joint_ix, drift }),
+            _ => Ok(self.in_chain_order(&mean(&span))),
+        }
     }
 
     fn in_chain_order(&self, position: &[f64]) -> Vec<f64> {
@@ -220,6 +368,12 @@ impl ArmCapture {
     pub fn hold(&mut self, stop: &Stop) -> crate::Result<()> {
         self.arm.hold(stop, |_| ())
     }
+}
+
+/// The joint with the largest distance from its target, and this distance.
+fn largest_error(actual: &[f64], target: &[f64]) -> Option<(usize, f64)> {
+    let errors = actual.iter().zip(target).map(|(actual, target)| (actual - target).abs());
+    errors.enumerate().max_by(|a, b| a.1.total_cmp(&b.1))
 }
 
 /// Mean joint positions.

@@ -10,6 +10,8 @@ pub struct Stop {
     requested: Arc<AtomicBool>,
     /// Set if a signal requested the stop.
     signaled: Arc<AtomicBool>,
+    /// Set by the first Ctrl-C. While it is set, the next Ctrl-C ends the process at once.
+    interrupted: Arc<AtomicBool>,
     /// Whether the signal was logged.
     logged: Arc<AtomicBool>,
     /// Message that is logged after a signal.
@@ -17,13 +19,23 @@ pub struct Stop {
 }
 
 impl Stop {
-    /// Creates a stop and a flag that a signal handler may set. Setting the flag requests the stop; the next query then
-    /// logs the message.
+    /// Creates a stop and two flags for signal handlers. Setting the first requests the stop; the next query then logs the
+    /// message. The second records a Ctrl-C, so that the next one ends the process at once.
     #[must_use]
-    pub fn with_signal_flag(message: &'static str) -> (Self, Arc<AtomicBool>) {
+    pub fn with_signal_flags(message: &'static str) -> (Self, [Arc<AtomicBool>; 2]) {
         let stop = Self { message, ..Self::default() };
-        let flag = stop.signaled.clone();
-        (stop, flag)
+        let flags = [stop.signaled.clone(), stop.interrupted.clone()];
+        (stop, flags)
+    }
+
+    /// Withdraws all requests, so that the next signal requests a stop again, with another message, and the next Ctrl-C
+    /// does not end the process at once.
+    pub fn rearm(&mut self, message: &'static str) {
+        self.message = message;
+        // A signal that arrives in between still requests a stop, because its handler sets `interrupted` first.
+        for flag in [&self.signaled, &self.requested, &self.logged, &self.interrupted] {
+            flag.store(false, Ordering::Relaxed);
+        }
     }
 
     /// Requests a stop.
@@ -45,5 +57,24 @@ impl Stop {
             log::info!("{}", self.message);
         }
         signaled
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn rearmed_stop_waits_for_the_next_signal() {
+        let (mut stop, [signaled, interrupted]) = Stop::with_signal_flags("stopping");
+        interrupted.store(true, Ordering::Relaxed);
+        signaled.store(true, Ordering::Relaxed);
+        stop.request();
+        assert!(stop.requested() && stop.signaled());
+        stop.rearm("ending");
+        assert!(!stop.requested() && !stop.signaled());
+        assert!(!interrupted.load(Ordering::Relaxed), "the next Ctrl-C would end the process at once");
+        signaled.store(true, Ordering::Relaxed);
+        assert!(stop.requested() && stop.signaled());
     }
 }

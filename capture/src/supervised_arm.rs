@@ -52,19 +52,43 @@ impl SupervisedArm {
     pub fn read(&mut self) -> crate::Result<JointState> {
         let deadline = clock::now().plus_secs(MAX_SILENCE.as_secs_f64());
         loop {
-            let state = self.arm.read(POLL);
-            if let Motion::Stopped { reason } = self.arm.motion() {
-                bail!("the arm stopped: {reason}. Inspect it, then recover it with `fieldrig move --recover`");
-            }
-            match state {
-                Err(Error::NoJoints { .. }) if clock::now() < deadline => {}
-                state => {
-                    let mut state = state?;
-                    state.position.iter_mut().zip(&self.offsets).for_each(|(position, offset)| *position += offset);
-                    return Ok(state);
-                }
+            match self.read_within(POLL)? {
+                Some(state) => return Ok(state),
+                None if clock::now() < deadline => {}
+                None => return Err(Error::NoJoints { waited: MAX_SILENCE }.into()),
             }
         }
+    }
+
+    /// Reads the next joint state. `None` if none arrives in time.
+    fn read_within(&mut self, timeout: Duration) -> crate::Result<Option<JointState>> {
+        let state = self.arm.read(timeout);
+        if let Motion::Stopped { reason } = self.arm.motion() {
+            bail!("the arm stopped: {reason}. Inspect it, then recover it with `fieldrig move --recover`");
+        }
+        match state {
+            Ok(mut state) => {
+                state.position.iter_mut().zip(&self.offsets).for_each(|(position, offset)| *position += offset);
+                Ok(Some(state))
+            }
+            Err(Error::NoJoints { .. }) => Ok(None),
+            Err(error) => Err(error.into()),
+        }
+    }
+
+    /// Reads the joint states that have already arrived, at most those of a few seconds.
+    ///
+    /// # Errors
+    /// As [`SupervisedArm::read`].
+    pub fn read_queued(&mut self, mut on_state: impl FnMut(&JointState)) -> crate::Result<()> {
+        const MAX_STATES: usize = 4000;
+        for _ in 0..MAX_STATES {
+            match self.read_within(Duration::ZERO)? {
+                Some(state) => on_state(&state),
+                None => break,
+            }
+        }
+        Ok(())
     }
 
     /// Sends a target; returns it as clamped to the limits.
@@ -84,13 +108,24 @@ impl SupervisedArm {
         Ok(with_offsets(&accepted, 1.0))
     }
 
-    /// Waits until the arm has arrived. If a stop is requested, brings it to rest instead.
+    /// Waits until the arm has arrived. If a stop is requested or the arm cannot be read, brings it to rest instead.
     ///
     /// * `on_state`: is called with each joint state.
     ///
     /// # Errors
-    /// If the arm has stopped because of a fault, or cannot be stopped.
-    pub fn follow(&mut self, stop: &Stop, mut on_state: impl FnMut(&JointState)) -> crate::Result<MotionEnd> {
+    /// If the arm has stopped because of a fault, reports nothing, or cannot be stopped.
+    pub fn follow(&mut self, stop: &Stop, on_state: impl FnMut(&JointState)) -> crate::Result<MotionEnd> {
+        let end = self.follow_while_read(stop, on_state);
+        if end.is_err()
+            && !matches!(self.arm.motion(), Motion::Stopped { .. })
+            && let Err(error) = self.arm.stop()
+        {
+            log::error!("cannot stop the arm, which may still move: {error}; press the emergency stop");
+        }
+        end
+    }
+
+    fn follow_while_read(&mut self, stop: &Stop, mut on_state: impl FnMut(&JointState)) -> crate::Result<MotionEnd> {
         loop {
             let state = self.read()?;
             on_state(&state);

@@ -23,9 +23,13 @@ pub struct ArmPlanOptions {
 
 /// Minimum number of poses: standard deviations from fewer are not reliable.
 pub const MIN_POSES: usize = 10;
-/// Number of poses in a row without the target after which the plan ends: more than there are rotations about a target
-/// whose place is wrong.
+/// Number of poses in a row without the target after which the plan ends. Larger than the six rotations about the target,
+/// all of which fail if the given camera pose is wrong.
 const MAX_UNSEEN: usize = 8;
+
+/// Standard deviation of the position up to which an estimate selects poses, as long as small rotations remain,
+/// millimeters.
+const MAX_EARLY_SIGMA_MM: f64 = 20.0;
 
 /// What an arm does next.
 #[derive(Clone, Debug, PartialEq)]
@@ -54,6 +58,14 @@ pub struct FirstView<'a> {
     pub parent_from_camera: &'a Transform,
 }
 
+impl FirstView<'_> {
+    /// Distance of a point of the board from the camera, meters. `None` if the view does not determine it.
+    pub fn distance_m(&self, point_in_board: &Vector3<f64>) -> Option<f64> {
+        let pose = planar_pose::board_poses(self.view, self.intrinsics).into_iter().next()?;
+        Some((pose.camera_from_board * Point3::from(*point_in_board)).coords.norm())
+    }
+}
+
 /// A plan for one calibration.
 #[derive(Debug)]
 pub struct ArmPlan<'a> {
@@ -69,7 +81,8 @@ pub struct ArmPlan<'a> {
 impl<'a> ArmPlan<'a> {
     /// Plans motions around the configuration at which the target is seen.
     ///
-    /// * `poses`: the board, for poses by information gain.
+    /// * `poses`: the board's size and the visibility limits for [`suggest_next_poses`]; `n_poses`, `reach` and `seed` are
+    ///   ignored.
     pub fn new(
         reach: &Reach<'a>,
         poses: &NextPoseOptions<'a>,
@@ -128,8 +141,9 @@ impl<'a> ArmPlan<'a> {
         if self.n_unseen >= MAX_UNSEEN {
             return ArmStep::Finished(format!("the target was not seen at the last {MAX_UNSEEN} poses"));
         }
-        // A few small rotations first: with fewer samples, an estimate may be far off.
-        if n < 5 || estimate.is_err() {
+        // A few small rotations first: with fewer samples, or a large uncertainty, an estimate may be far off.
+        let is_uncertain = |found: &HandEyeCalibration| found.sigma_mm.iter().any(|sigma| *sigma > MAX_EARLY_SIGMA_MM);
+        if n < 5 || estimate.as_ref().map_or(true, |found| is_uncertain(found)) {
             while let Some((pose, purpose)) = self.first.pop_front() {
                 if let Some(joints) = self.reach.joints_for(&pose, current) {
                     return ArmStep::Move { joints, purpose };
@@ -145,7 +159,7 @@ impl<'a> ArmPlan<'a> {
         let options = NextPoseOptions { reach: Some((self.reach, current)), seed: self.n_refined as u64, ..self.poses };
         match suggest_next_poses(input, calibration, &options).pop() {
             Some(next) => match next.joints {
-                Some(joints) => ArmStep::Move { joints, purpose: next.motion },
+                Some(joints) => ArmStep::Move { joints, purpose: next.relation },
                 None => ArmStep::Finished("the arm reaches no other pose that shows the target".to_owned()),
             },
             None => ArmStep::Finished(
@@ -168,8 +182,8 @@ fn first_poses(
     const DIRECTIONS: [(f64, usize); 6] = [(1.0, 0), (1.0, 1), (1.0, 2), (-1.0, 0), (-1.0, 1), (-1.0, 2)];
     let Ok(start) = reach.chain.forward(reach.start) else { return VecDeque::new() };
     let unit = |(sign, axis): (f64, usize)| Vector3::from_fn(|row, _| if row == axis { sign } else { 0.0 });
-    let name = |(sign, axis): (f64, usize), degrees: f64, body: &str| {
-        format!("rotate by {:.0} degrees around the {body}'s {} axis", sign * degrees, ["x", "y", "z"][axis])
+    let name = |verb: &str, (sign, axis): (f64, usize), degrees: f64, body: &str| {
+        format!("{verb} by {:.0} degrees about the {body}'s {} axis", sign * degrees, ["x", "y", "z"][axis])
     };
     let mut poses = VecDeque::new();
     if let Some(board) = planar_pose::board_poses(first.view, first.intrinsics).first() {
@@ -182,13 +196,13 @@ fn first_poses(
             let axis = base_from_camera.rotation * unit(direction);
             let turn = UnitQuaternion::from_scaled_axis(axis * ABOUT_TARGET_DEG.to_radians());
             let about_center = Transform::from_parts((center - turn * center).into(), turn);
-            (about_center * start, format!("{}, about the target", name(direction, ABOUT_TARGET_DEG, "camera")))
+            (about_center * start, name("orbit the target", direction, ABOUT_TARGET_DEG, "camera"))
         }));
     }
     for degrees in ABOUT_FLANGE_DEG {
         poses.extend(DIRECTIONS.map(|direction| {
             let rotation = Transform::new(Vector3::zeros(), unit(direction) * degrees.to_radians());
-            (start * rotation, name(direction, degrees, "flange"))
+            (start * rotation, name("rotate the flange", direction, degrees, "flange"))
         }));
     }
     poses

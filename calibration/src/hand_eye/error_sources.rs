@@ -19,7 +19,7 @@ pub(super) fn warning(noise: &HandEyeNoise, scatter: Scatter, rms_px: Option<f64
     has_large_error.then_some(())?;
     let reprojection = rms_px.map_or_else(String::new, |rms_px| format!("{rms_px:.1} px, "));
     let errors = format!(
-        "the errors are large ({reprojection}{:.1} mm and {:.2} degrees; usual are at most {MAX_RMS_PX} px, {} mm and {} degrees)",
+        "the errors are large ({reprojection}{:.1} mm and {:.2} degrees; errors are usually at most {MAX_RMS_PX} px, {} mm and {} degrees)",
         scatter.mm, scatter.deg, MAX_SCATTER.mm, MAX_SCATTER.deg
     );
     let robot = "check that the arm stood still in each image, that each pose belongs to its image (time offset), that the flange or tool frame is the same in all poses, and that the target and the camera did not move";
@@ -28,7 +28,7 @@ pub(super) fn warning(noise: &HandEyeNoise, scatter: Scatter, rms_px: Option<f64
             "{errors}; even single images differ from the board by {residual_px:.1} px, so the lens or the target is wrong: calibrate the intrinsics, and check that the target is flat and has the given size"
         ),
         Some(residual_px) => format!(
-            "{errors}, but single images fit the board within {residual_px:.1} px, so lens and target are right and the robot poses are not those of the images: {robot}"
+            "{errors}, but single images fit the board within {residual_px:.1} px, so lens and target are right and the robot poses do not match the images: {robot}"
         ),
         None => format!("{errors}; {robot}, and that the intrinsics of the board poses are right"),
     })
@@ -45,7 +45,10 @@ mod tests {
         let (small, large) = (Scatter { mm: 1.0, deg: 0.1 }, Scatter { mm: 4.0, deg: 0.8 });
         assert_eq!(warning(&noise(Some(0.2)), small, Some(1.0)), None);
         let robot = warning(&noise(Some(0.2)), large, Some(9.0)).unwrap();
-        assert!(robot.contains("9.0 px, 4.0 mm and 0.80 degrees") && robot.contains("robot poses are not"), "{robot}");
+        assert!(
+            robot.contains("9.0 px, 4.0 mm and 0.80 degrees") && robot.contains("robot poses do not match"),
+            "{robot}"
+        );
         let lens = warning(&noise(Some(2.0)), small, Some(9.0)).unwrap();
         assert!(lens.contains("the lens or the target is wrong"), "{lens}");
         let poses = warning(&noise(None), large, None).unwrap();

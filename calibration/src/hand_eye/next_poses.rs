@@ -39,6 +39,8 @@ pub struct NextPose {
     pub joints: Option<Vec<f64>>,
     /// The motion from the closest sample, as a sentence.
     pub motion: String,
+    /// Its rotation relative to this sample, for example `rotated by 20 degrees about the camera's x axis relative to pose 3`.
+    pub relation: String,
     /// Factor by which the standard deviations of the hand-eye transform shrink on average, 0 to 1.
     pub sigma_frac: f64,
 }
@@ -76,10 +78,12 @@ pub fn suggest_next_poses(
             .max_by(|a, b| a.0.total_cmp(&b.0));
         let Some((gain, best)) = best.filter(|(gain, _)| *gain > 0.0) else { break };
         information += &best.information;
+        let [motion, relation] = scene.motion(best);
         suggested.push(NextPose {
             base_from_flange: best.base_from_flange,
             joints: best.joints.clone(),
-            motion: scene.motion(best),
+            motion,
+            relation,
             sigma_frac: (-gain / 12.0).exp(),
         });
     }
@@ -222,7 +226,8 @@ impl Scene<'_> {
         }
     }
 
-    fn motion(&self, candidate: &Candidate) -> String {
+    /// The motion from the closest sample, as an instruction, and its rotation, as a description.
+    fn motion(&self, candidate: &Candidate) -> [String; 2] {
         let sample = &self.input.samples[candidate.sample_ix];
         let old_from_new = sample.base_from_flange.inverse() * candidate.base_from_flange;
         // The same rotation in camera axes (eye in hand).
@@ -242,9 +247,11 @@ impl Scene<'_> {
         };
         // Adding zero turns a negative zero into a positive one.
         let [right, down, forward]: [f64; 3] = moved.map(|meters| (1e3 * meters).round() + 0.0).into();
-        format!(
+        let relation = format!("rotated by {signed_deg:.0} degrees about {name} relative to {}", sample.name);
+        let motion = format!(
             "from the pose of {:?}, rotate the flange by {signed_deg:.0} degrees around {name} and move it by ({right}, {down}, {forward}) mm along the {body}'s x, y and z axes",
             sample.name
-        )
+        );
+        [motion, relation]
     }
 }

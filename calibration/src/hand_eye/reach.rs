@@ -4,8 +4,9 @@ use kinematics::{Chain, Transform};
 
 /// Distance that configurations keep from the limits of the joints, radians or meters.
 const LIMIT_MARGIN: f64 = 0.05;
-/// Number of configurations on a path at which the distance from the start is checked.
-const PATH_STEPS: u32 = 8;
+/// Largest change of a joint between two configurations of a path at which the distance from the start is checked, radians
+/// or meters.
+const PATH_STEP: f64 = 0.05;
 
 /// The space around a start configuration in which an arm moves.
 #[derive(Clone, Copy, Debug)]
@@ -21,8 +22,8 @@ pub struct Reach<'a> {
 }
 
 impl Reach<'_> {
-    /// Joint values for a flange pose, if the arm reaches it on a straight path in joint space from `current` that stays
-    /// near the start.
+    /// Joint values for a flange pose, if straight paths in joint space from `current` to it, and from it back to the start,
+    /// stay near the start.
     pub fn joints_for(&self, base_from_flange: &Transform, current: &[f64]) -> Option<Vec<f64>> {
         let start = self.chain.forward(self.start).ok()?;
         let distance_m = |pose: &Transform| (pose.translation.vector - start.translation.vector).norm();
@@ -42,12 +43,17 @@ impl Reach<'_> {
             })
             .collect();
         let joints = self.chain.inverse(base_from_flange, self.start, &bounds).ok()??;
-        let is_near = |step: u32| {
-            let share = f64::from(step) / f64::from(PATH_STEPS);
-            let between: Vec<f64> = current.iter().zip(&joints).map(|(from, to)| from + share * (to - from)).collect();
-            self.chain.forward(&between).is_ok_and(|pose| distance_m(&pose) <= self.max_distance_m)
+        let is_near = |from: &[f64]| {
+            let largest = from.iter().zip(&joints).map(|(from, to)| (to - from).abs()).fold(0.0, f64::max);
+            #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "joints move by a few radians")]
+            let n_steps = (largest / PATH_STEP).ceil().clamp(1.0, 10_000.0) as u32;
+            (1..n_steps).all(|step| {
+                let share = f64::from(step) / f64::from(n_steps);
+                let between: Vec<f64> = from.iter().zip(&joints).map(|(from, to)| from + share * (to - from)).collect();
+                self.chain.forward(&between).is_ok_and(|pose| distance_m(&pose) <= self.max_distance_m)
+            })
         };
-        (current.len() == joints.len() && (1..PATH_STEPS).all(is_near)).then_some(joints)
+        (current.len() == joints.len() && is_near(current) && is_near(self.start)).then_some(joints)
     }
 }
 
@@ -76,6 +82,22 @@ mod tests {
         let mut current = START;
         current[3] += 1.2;
         assert_eq!(reach.joints_for(&near, &current), None, "the path is too far");
+    }
+
+    #[test]
+    fn path_back_to_the_start_stays_near_it() {
+        let chain = Chain::from_urdf(PANDA, "panda_link0", "panda_link8").unwrap();
+        let wide = Reach { chain: &chain, start: &START, max_joint_change: 1.5, max_distance_m: 0.5 };
+        let start = chain.forward(&START).unwrap();
+        // The flange is where it was, but on the way it moves.
+        let turned = start * Transform::new(Vector3::zeros(), Vector3::y() * 0.7);
+        let joints = wide.joints_for(&turned, &START).expect("the pose is near");
+        let middle: Vec<f64> = joints.iter().zip(&START).map(|(a, b)| 0.5 * (a + b)).collect();
+        let middle = chain.forward(&middle).unwrap();
+        let largest_m = (middle.translation.vector - start.translation.vector).norm();
+        assert!(largest_m > 0.002, "{largest_m} m");
+        let narrow = Reach { max_distance_m: 0.9 * largest_m, ..wide };
+        assert_eq!(narrow.joints_for(&turned, &joints), None, "the arm is there, but cannot return");
     }
 
     #[test]

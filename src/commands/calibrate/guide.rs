@@ -86,8 +86,10 @@ impl<'a> Guide<'a> {
                 (so_far, guidance.advice.to_string(), guidance.advice == HandEyeAdvice::Enough)
             }
         };
-        let next = if is_enough { "; press Ctrl-C to end the recording" } else { "" };
-        format!("{so_far}; next: {advice}{next}")
+        match is_enough {
+            true => format!("{so_far}; {advice}: press Ctrl-C to calibrate"),
+            false => format!("{so_far}; next: {advice}"),
+        }
     }
 
     fn show(&self, text: &str) {

@@ -218,7 +218,7 @@ impl Args {
     /// Reads the samples file or the images of a recording or rig, or moves the arm to take images. `output` gets the
     /// calibration that devices report.
     fn source(&self, keeps_photos: bool, output: Option<&mut RigOutput>) -> anyhow::Result<(Source, Option<MovedArm>)> {
-        let has = |what: &str, flag: &str| BadArgument(format!("{flag}: {}; remove the flag", what));
+        let has = |what: &str, flag: &str| BadArgument(format!("{flag}: {what}; remove the flag"));
         let (scan, arm) = if self.motion.is_requested {
             let (scan, arm) = self.motion.run(&self.request(keeps_photos)?, output)?;
             (Some(scan), Some(arm))
@@ -247,6 +247,10 @@ impl Args {
             let why = "--target is required with --move, for example --target charuco:5x7:34mm:26mm:5X5_100";
             return Err(BadArgument(why.to_owned()).into());
         };
+        if self.urdf.is_some() {
+            let why = "--urdf: the rig file names the robot description; remove the flag";
+            return Err(BadArgument(why.to_owned()).into());
+        }
         Ok(Request { input: &self.input, target, rig: &self.rig, options: self.options(), keeps_photos })
     }
 

@@ -23,6 +23,8 @@ use targets::{GrayImage, TargetSpec};
 
 /// Largest change of a joint from the start, radians.
 const MAX_JOINT_CHANGE_RAD: f64 = 1.2;
+/// Maximum distance of the flange from its position at the start, unless a flag sets it, meters.
+const DEFAULT_DISTANCE_M: f64 = 0.3;
 /// Standard deviation of the rotation at which the result is accurate, degrees.
 const GOAL_DEG: f64 = 0.05;
 
@@ -30,7 +32,8 @@ const GOAL_DEG: f64 = 0.05;
 #[derive(Debug, clap::Args)]
 pub(super) struct MoveFlags {
     /// With a rig file: move the arm to poses that show the target, until the result is accurate. The target must be
-    /// visible at the start; the arm returns there at the end
+    /// visible at the start; the arm returns there at the end. It does not avoid obstacles, and does not check for
+    /// collisions of the arm with itself, its base or cables
     #[arg(long = "move")]
     pub(super) is_requested: bool,
     /// With --move: confirm the motion: nobody is within reach of the arm, and a hand is on the emergency stop. Not needed
@@ -38,22 +41,23 @@ pub(super) struct MoveFlags {
     #[arg(long, requires = "is_requested")]
     enable_motion: bool,
     /// With --move: maximum number of poses
-    #[arg(long, value_name = "N", default_value_t = 20, requires = "is_requested", value_parser = clap::value_parser!(u16).range(3..=200))]
+    #[arg(long, value_name = "N", default_value_t = 20, requires = "is_requested", value_parser = clap::value_parser!(u16).range(10..=200))]
     max_poses: u16,
     /// With --move: end when the standard deviations of the position are this small, millimeters
     #[arg(long, value_name = "MM", default_value_t = 0.2, requires = "is_requested", value_parser = super::super::super::number_in_range(1e-3..=100.0))]
     goal_mm: f64,
-    /// With --move: maximum distance of the flange from its position at the start, millimeters
-    #[arg(long, value_name = "MM", default_value_t = 300.0, requires = "is_requested", value_parser = super::super::super::number_in_range(10.0..=5000.0))]
-    max_distance_mm: f64,
+    /// With --move: maximum distance of the flange from its position at the start, millimeters; tool, camera, target and
+    /// elbow can reach farther. Default: 300; with a camera on the flange, at most half its distance to the target
+    #[arg(long, value_name = "MM", requires = "is_requested", value_parser = super::super::super::number_in_range(10.0..=5000.0))]
+    max_distance_mm: Option<f64>,
 }
 
 /// An arm after it has moved.
 pub(super) struct MovedArm {
     capture: ArmCapture,
     stop: Stop,
-    /// Whether the motors hold the arm without this program.
-    is_safe: bool,
+    /// Whether the motors hold the arm after this program has ended.
+    holds_on_exit: bool,
     /// Why the motion was not completed.
     failure: Option<anyhow::Error>,
 }
@@ -63,25 +67,39 @@ impl MovedArm {
     /// was not completed.
     pub(super) fn finish(mut self, result: anyhow::Result<Exit>) -> anyhow::Result<Exit> {
         let failure = self.failure.take();
-        match (self.hold(), failure) {
-            (Err(error), None) => Err(error),
-            (_, Some(failure)) => {
-                outputs::log_failure(result.map(|_| ()));
+        let held = self.hold_after(result.as_ref().err());
+        match (held, failure) {
+            (Err(error), None) if result.is_ok() => Err(error),
+            (held, Some(failure)) => {
+                // Why the motion was not completed has been logged.
+                outputs::log_failure(held);
+                if self.holds_on_exit {
+                    outputs::log_failure(result.map(|_| ()));
+                }
                 Err(failure)
             }
-            (Ok(()), None) => result,
+            (held, None) => {
+                outputs::log_failure(held);
+                result
+            }
         }
     }
 
-    /// Holds an arm whose motors would release it, until Ctrl-C. An error if the arm has stopped because of a fault.
-    fn hold(&mut self) -> anyhow::Result<()> {
-        if self.is_safe {
+    /// Holds an arm whose motors would release it, until a signal. Before, logs the error that the program ends with.
+    ///
+    /// # Errors
+    /// If the arm has stopped because of a fault.
+    fn hold_after(&mut self, error: Option<&anyhow::Error>) -> anyhow::Result<()> {
+        if self.holds_on_exit {
             return Ok(());
         }
+        if let Some(error) = error {
+            log::error!("{error:#}");
+        }
+        // The next Ctrl-C ends the hold in order, even if an earlier one has stopped the motion.
+        self.stop.rearm("ending; the motors no longer hold the arm");
         log::info!("{}", move_arm::HOLDING);
-        // If Ctrl-C has stopped the motion, the next one ends the program at once.
-        let stop = if self.stop.requested() { Stop::default() } else { self.stop.clone() };
-        Ok(self.capture.hold(&stop)?)
+        Ok(self.capture.hold(&self.stop)?)
     }
 }
 
@@ -104,10 +122,13 @@ impl MoveFlags {
         let (input, flags) = (request.input.display(), request.rig);
         flags.check(request.input)?;
         if InputKind::of(request.input) != InputKind::Rig {
-            return Err(BadArgument(format!("--move needs a rig file (.toml) as input; {input} is none")).into());
+            return Err(BadArgument(format!("--move needs a rig file (.toml) as input; {input} is not one")).into());
         }
         if flags.seconds.is_some() {
-            return Err(BadArgument("--seconds: with --move, the arm decides; use --max-poses".to_owned()).into());
+            return Err(BadArgument(
+                "--seconds cannot be combined with --move; limit the number of poses with --max-poses".to_owned(),
+            )
+            .into());
         }
         let given = Rig::load(request.input, &[])?;
         let camera = flags.camera_of(&given)?.name.clone();
@@ -117,6 +138,7 @@ impl MoveFlags {
         let is_simulated = flags.sim || given.arm.driver == ArmDriver::Sim;
         if !is_simulated {
             move_arm::motion_of(&given)?;
+            open::check_motion(&given)?;
             if !self.enable_motion {
                 return Err(BadArgument(
                     "--move moves the arm: add --enable-motion to confirm that nobody is within reach of the arm and that a hand is on the emergency stop"
@@ -144,12 +166,13 @@ impl MoveFlags {
         let mut images = Images { camera: &camera, base_or_flange_from_camera, request, found, photos };
         let failure = self.take_images(&mut capture, &mut images, &stop).err();
         let Images { found, photos, .. } = images;
-        let is_safe = is_simulated || given.arm.motion.as_ref().is_some_and(|motion| motion.on_loss == OnLoss::Hold);
-        let mut arm = MovedArm { capture, stop, is_safe, failure: None };
+        let holds_on_exit =
+            is_simulated || given.arm.motion.as_ref().is_some_and(|motion| motion.on_loss == OnLoss::Hold);
+        let mut arm = MovedArm { capture, stop, holds_on_exit, failure: None };
         match failure {
-            // Without the target at the start, nothing has moved.
+            // At most the first motion was tried.
             Some(error) if found.len() < 2 => {
-                outputs::log_failure(arm.hold());
+                outputs::log_failure(arm.hold_after(Some(&error)));
                 return Err(error);
             }
             Some(error) => {
@@ -158,7 +181,25 @@ impl MoveFlags {
             }
             None => (),
         }
-        Ok((Scan::new(rig, camera, found, photos)?, arm))
+        match Scan::new(rig, camera, found, photos) {
+            Ok(scan) => Ok((scan, arm)),
+            Err(error) => {
+                outputs::log_failure(arm.hold_after(Some(&error)));
+                Err(arm.failure.unwrap_or(error))
+            }
+        }
+    }
+
+    /// Maximum distance of the flange from its position at the start.
+    ///
+    /// * `distance_m`: distance of the target from the camera at the start.
+    fn max_distance_m(&self, setup: Setup, distance_m: Option<f64>) -> f64 {
+        match (self.max_distance_mm, setup, distance_m) {
+            (Some(mm), ..) => 1e-3 * mm,
+            // A camera on the flange must not reach the target.
+            (None, Setup::EyeInHand, Some(distance_m)) => DEFAULT_DISTANCE_M.min(0.5 * distance_m),
+            (None, ..) => DEFAULT_DISTANCE_M,
+        }
     }
 
     /// Takes images until the plan is finished, then returns to the start. Ctrl-C stops the arm where it is.
@@ -167,12 +208,6 @@ impl MoveFlags {
         let chain = capture.chain().clone();
         let Some(first) = capture.image(stop)? else { return Ok(()) };
         let view = images.add(first)?;
-        let reach = Reach {
-            chain: &chain,
-            start: &start,
-            max_joint_change: MAX_JOINT_CHANGE_RAD,
-            max_distance_m: 1e-3 * self.max_distance_mm,
-        };
         // Joint offsets are not part of the plan, so all poses are used for them.
         let goal_mm = if images.request.options.estimate_joint_offsets { 0.0 } else { self.goal_mm };
         let goals = ArmPlanOptions { max_poses: self.max_poses.into(), goal_mm, goal_deg: GOAL_DEG };
@@ -183,6 +218,12 @@ impl MoveFlags {
             intrinsics: &images.camera.intrinsics,
             parent_from_camera: &images.base_or_flange_from_camera,
         };
+        let distance_m = first.distance_m(&poses.center_in_board);
+        let max_distance_m = self.max_distance_m(first.setup, distance_m);
+        let target = distance_m.map_or_else(String::new, |m| format!("target at {m:.2} m; "));
+        log::info!("{target}the flange moves at most {max_distance_m:.2} m from its start");
+        capture.limit_distance(max_distance_m)?;
+        let reach = Reach { chain: &chain, start: &start, max_joint_change: MAX_JOINT_CHANGE_RAD, max_distance_m };
         let mut plan = ArmPlan::new(&reach, &poses, &goals, &first);
         let symmetries = images.request.target.symmetry();
         loop {
@@ -191,7 +232,7 @@ impl MoveFlags {
             if let Ok(found) = &estimate {
                 let largest = |sigmas: [f64; 3]| sigmas.into_iter().fold(0.0, f64::max);
                 let (mm, deg) = (largest(found.sigma_mm), largest(found.sigma_deg));
-                log::info!("so far: +- {mm:.2} mm, +- {deg:.3} degrees");
+                log::info!("standard deviations so far: {mm:.2} mm, {deg:.3} degrees");
             }
             let current = capture.joints()?;
             let (joints, purpose) = match plan.next(&estimate_input, estimate.as_ref(), &current) {

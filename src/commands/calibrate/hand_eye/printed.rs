@@ -75,7 +75,7 @@ pub(super) struct PrintedSample {
 
 impl PrintedPose {
     pub(super) fn of(next: NextPose) -> Self {
-        let NextPose { base_from_flange, joints, motion, sigma_frac } = next;
+        let NextPose { base_from_flange, joints, motion, sigma_frac, .. } = next;
         Self { base_from_flange: matrix_of(&base_from_flange), joints, motion, sigma_frac }
     }
 }
