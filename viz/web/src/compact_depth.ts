@@ -2,6 +2,10 @@
 
 /** Symbol of a pixel whose count follows after the symbols. */
 const ESCAPE = 255;
+/** The server renders at most 4096 x 4096 pixels. */
+const MAX_PIXELS = 4096 * 4096;
+/** A symbol and an escaped count. */
+const MAX_BYTES_PER_PIXEL = 3;
 
 /** Depths in meters, 0 without a surface. */
 export async function decodeCompactDepth(
@@ -10,9 +14,10 @@ export async function decodeCompactDepth(
   minM: number,
   logStep: number,
 ): Promise<Float32Array<ArrayBuffer>> {
-  const stream = new Blob([zlib]).stream().pipeThrough(new DecompressionStream("deflate"));
-  const bytes = new Uint8Array(await new Response(stream).arrayBuffer());
   const n = width * height;
+  if (!(n <= MAX_PIXELS)) throw new Error(`a depth image has ${width} x ${height} pixels, more than ${MAX_PIXELS}`);
+  const bytes = await inflated(zlib, MAX_BYTES_PER_PIXEL * n);
+  if (bytes.length < n) throw new Error(`a depth image has ${bytes.length} symbols, not ${n}`);
   const codes = new Uint16Array(n);
   let escaped = n;
   let largest = 0;
@@ -33,9 +38,32 @@ export async function decodeCompactDepth(
       if (code > largest) largest = code;
     }
   }
+  if (escaped !== bytes.length) throw new Error(`a depth image has ${bytes.length} bytes, not ${escaped}`);
   const meters = new Float32Array(largest + 1);
   for (let code = 1; code <= largest; code++) meters[code] = minM * Math.exp(logStep * (code - 1));
   const depth = new Float32Array(n);
   for (let ix = 0; ix < n; ix++) depth[ix] = meters[codes[ix]!]!;
   return depth;
+}
+
+/** Decompresses a zlib stream. Stops with an error above a maximum length. */
+async function inflated(zlib: Uint8Array<ArrayBuffer>, maxBytes: number): Promise<Uint8Array<ArrayBuffer>> {
+  const chunks: Uint8Array<ArrayBuffer>[] = [];
+  let nBytes = 0;
+  const reader = new Blob([zlib]).stream().pipeThrough(new DecompressionStream("deflate")).getReader();
+  for (let next = await reader.read(); !next.done; next = await reader.read()) {
+    chunks.push(next.value);
+    nBytes += next.value.length;
+    if (nBytes > maxBytes) {
+      void reader.cancel();
+      throw new Error(`a depth image is longer than ${maxBytes} bytes`);
+    }
+  }
+  const bytes = new Uint8Array(nBytes);
+  let offset = 0;
+  for (const chunk of chunks) {
+    bytes.set(chunk, offset);
+    offset += chunk.length;
+  }
+  return bytes;
 }

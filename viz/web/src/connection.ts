@@ -32,7 +32,7 @@ export class Connection {
   readonly clock = new ServerClock();
   /** Bytes received since the page was opened. */
   nReceived = 0;
-  /** Time from the last ping to its answer; null before the first. */
+  /** Time from the last ping to its answer; null before the first answer of a connection. */
   roundTripMillis: number | null = null;
   private readonly parts = new PartJoiner();
   private capabilities: ReadonlySet<string> = new Set();
@@ -85,6 +85,7 @@ export class Connection {
     this.capabilities = new Set();
     this.receivedAt = performance.now();
     this.clock.forget();
+    this.roundTripMillis = null;
   }
 
   /** Abandons the socket; a new one is opened after a pause. */

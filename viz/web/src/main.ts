@@ -131,7 +131,13 @@ function receiveBinary(header: BinaryHeader, payload: Uint8Array<ArrayBuffer>): 
 
 async function showPicture(header: PictureHeader, payload: Uint8Array<ArrayBuffer>): Promise<void> {
   const millis = scheduler.answered(header);
-  if (!(await view.picture.show(header, payload, view.emptyDepth))) return;
+  try {
+    if (!(await view.picture.show(header, payload, view.emptyDepth))) return;
+  } catch (error) {
+    scheduler.failed(header.id);
+    element("notice").textContent = `Cannot show a picture: ${error instanceof Error ? error.message : String(error)}`;
+    return;
+  }
   view.changed();
   element("notice").textContent = "";
   const [width, height] = header.size_px;
@@ -180,8 +186,8 @@ toggle("toggle-keyframes", "k", (isOn) => (view.overlays.showsKeyframes = isOn))
 toggle("toggle-crop", "x", (isOn) => (view.crop.enabled = isOn));
 toggle("toggle-follow", "l", (isOn) => (view.follows = isOn));
 toggle("toggle-points", "p", (isOn) => {
+  view.points.enabled = isOn;
   subscriptions.points = isOn;
-  if (!isOn) view.points.clear();
 });
 toggle("toggle-robot", "b", (isOn) => (view.robot.enabled = isOn));
 toggle("toggle-occlude", "o", (isOn) => (view.occlusion.enabled = isOn));

@@ -2,6 +2,9 @@
 
 import type { PartHeader } from "./protocol";
 
+/** Longer messages are ignored. The largest pictures, with depth as floats, have about 100 MiB. */
+const MAX_BYTES = 256 * 1024 * 1024;
+
 export class PartJoiner {
   private message = -1;
   private bytes = new Uint8Array(0);
@@ -10,9 +13,10 @@ export class PartJoiner {
   /** Adds a part. Returns the message if it is complete. */
   add(header: PartHeader, payload: Uint8Array): ArrayBuffer | null {
     if (header.offset === 0) {
+      this.forget();
+      if (!(header.bytes <= MAX_BYTES)) return null;
       this.message = header.message;
       this.bytes = new Uint8Array(header.bytes);
-      this.nJoined = 0;
     }
     const isNext = header.message === this.message && header.offset === this.nJoined;
     if (!isNext || header.offset + payload.length > this.bytes.length) return null;
@@ -28,5 +32,6 @@ export class PartJoiner {
   forget(): void {
     this.message = -1;
     this.bytes = new Uint8Array(0);
+    this.nJoined = 0;
   }
 }

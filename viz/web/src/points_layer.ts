@@ -12,6 +12,7 @@ export class PointsLayer {
   private readonly material: THREE.PointsMaterial;
   private readonly byKeyframe = new Map<number, THREE.Points>();
   private poses = new Map<number, number[]>();
+  private isEnabled = false;
 
   constructor(occlusion: Occlusion) {
     this.material = occlusion.apply(
@@ -20,8 +21,16 @@ export class PointsLayer {
     );
   }
 
-  /** Adds the points of a keyframe. */
+  /** Whether points are drawn. While they are not, none are kept: the server sends all of them again. */
+  set enabled(enabled: boolean) {
+    this.isEnabled = enabled;
+    this.root.visible = enabled;
+    if (!enabled) this.clear();
+  }
+
+  /** Adds the points of a keyframe, unless points are not drawn. */
   add(header: KeyframePointsHeader, payload: Uint8Array<ArrayBuffer>): void {
+    if (!this.isEnabled) return;
     const pose = this.poses.get(header.id);
     if (!pose) return;
     this.remove(header.id);

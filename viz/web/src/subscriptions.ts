@@ -15,19 +15,28 @@ const HIDDEN_STATUS_HZ = 0.5;
 /** Limits of the height of camera images, in CSS pixels: see `.live canvas` in app.css. */
 const IMAGE_HEIGHT = { min: 90, max: 190, ofWindow: 0.22 };
 const MAX_IMAGE_WIDTH_PX = 640;
+/** The server rounds image sizes down to multiples of this. */
+const IMAGE_STEP_PX = 16;
+/** While the window is being resized, image sizes are not sent. */
+const RESIZE_PAUSE_MILLIS = 200;
 
 export class Subscriptions {
-  private sent = "";
+  /** The message sent last for each topic. A message that changes nothing would restart its topic. */
+  private readonly sent = new Map<SubscribeMessage["topic"], string>();
+  private resizeTimer = 0;
   private showsPoints = false;
 
   constructor(private readonly connection: Connection) {
     document.addEventListener("visibilitychange", () => this.update());
-    window.addEventListener("resize", () => this.update());
+    window.addEventListener("resize", () => {
+      window.clearTimeout(this.resizeTimer);
+      this.resizeTimer = window.setTimeout(() => this.update(), RESIZE_PAUSE_MILLIS);
+    });
   }
 
   /** Subscribes anew: a new connection has the server's defaults. */
   restart(): void {
-    this.sent = "";
+    this.sent.clear();
     this.update();
   }
 
@@ -39,11 +48,12 @@ export class Subscriptions {
 
   private update(): void {
     if (!this.connection.isOpen || !this.connection.supports("subscribe")) return;
-    const messages = document.hidden ? this.whileHidden() : this.whileVisible();
-    const key = JSON.stringify(messages);
-    if (key === this.sent) return;
-    this.sent = key;
-    for (const message of messages) this.connection.send(message);
+    for (const message of document.hidden ? this.whileHidden() : this.whileVisible()) {
+      const json = JSON.stringify(message);
+      if (this.sent.get(message.topic) === json) continue;
+      this.sent.set(message.topic, json);
+      this.connection.send(message);
+    }
   }
 
   private whileVisible(): SubscribeMessage[] {
@@ -56,7 +66,7 @@ export class Subscriptions {
         type: "subscribe",
         topic: "live_images",
         rate_hz: IMAGES_HZ,
-        size_px: [MAX_IMAGE_WIDTH_PX, Math.round(height)],
+        size_px: [MAX_IMAGE_WIDTH_PX, IMAGE_STEP_PX * Math.ceil(height / IMAGE_STEP_PX)],
       },
     ];
     if (this.connection.supports("robot")) {
