@@ -22,7 +22,7 @@ const MAX_CLIENTS: usize = 32;
 const DESCRIPTORS_PER_CONNECTION: usize = 4;
 /// A connection whose peer accepts no bytes for this long is closed.
 const WRITE_TIMEOUT: Duration = Duration::from_secs(5);
-/// An HTTP connection without a new request for this long is closed.
+/// An HTTP connection that has neither received a request nor sent data for this long is closed.
 const IDLE_TIMEOUT: Duration = Duration::from_secs(10);
 /// A client that does not answer a ping within this time is disconnected.
 const PONG_TIMEOUT: Duration = Duration::from_secs(8);
@@ -96,6 +96,8 @@ struct ConnectionState {
     blocked_since: Option<Instant>,
     /// Time at which the last request was complete; `None` before the first.
     requested: Option<Instant>,
+    /// Time at which the kernel last accepted data for the peer.
+    written: Option<Instant>,
     opened: Instant,
     /// The WebSocket client, if the connection was accepted as one.
     client: Option<Client>,
@@ -110,6 +112,13 @@ struct Client {
     pinged: Option<Instant>,
     /// Whether the client has ever answered a ping, which shows that it reads.
     has_answered: bool,
+}
+
+impl ConnectionState {
+    /// Time of the last request or of the last bytes of a response; of the connection before the first request.
+    fn idle_since(&self) -> Instant {
+        self.requested.max(self.written).unwrap_or(self.opened)
+    }
 }
 
 /// Eviction order of clients: unresponsive first, then never used, then idle; within a group by time.
@@ -138,7 +147,7 @@ impl Admission {
         let candidates = registry.connections.values().filter_map(|connection| {
             let state = connection.state();
             let is_candidate = !state.is_closed && state.client.is_none();
-            is_candidate.then_some((state.requested.is_some(), state.requested.unwrap_or(state.opened), connection))
+            is_candidate.then_some((state.requested.is_some(), state.idle_since(), connection))
         });
         let oldest = candidates.min_by_key(|(has_requested, since, _)| (*has_requested, *since));
         oldest.inspect(|(.., connection)| connection.close("replaced by a new connection")).is_some()
@@ -199,6 +208,7 @@ impl Connection {
             writer: None,
             blocked_since: None,
             requested: None,
+            written: None,
             opened: Instant::now(),
             client: None,
         };
@@ -277,10 +287,7 @@ impl Connection {
         }
         match &state.client {
             Some(client) => is_timed_out(client.pinged, PONG_TIMEOUT).then_some("it does not answer pings"),
-            None => {
-                let idle_since = Some(state.requested.unwrap_or(state.opened));
-                is_timed_out(idle_since, IDLE_TIMEOUT).then_some("it has been idle for too long")
-            }
+            None => is_timed_out(Some(state.idle_since()), IDLE_TIMEOUT).then_some("it has been idle for too long"),
         }
     }
 
@@ -349,7 +356,12 @@ impl GuardedStream {
                 state.blocked_since.get_or_insert_with(Instant::now);
                 state.writer = Some(context.waker().clone());
             }
-            Poll::Ready(_) => state.blocked_since = None,
+            Poll::Ready(result) => {
+                state.blocked_since = None;
+                if result.as_ref().is_ok_and(|n_bytes| *n_bytes > 0) {
+                    state.written = Some(Instant::now());
+                }
+            }
         }
         drop(state);
         written
@@ -413,7 +425,10 @@ impl Drop for GuardedStream {
 
 #[cfg(test)]
 mod tests {
-    use super::{Admission, GuardedStream, IDLE_CLIENT_AFTER, Limits, PONG_TIMEOUT, UNRESPONSIVE_AFTER, WRITE_TIMEOUT};
+    use super::{
+        Admission, GuardedStream, IDLE_CLIENT_AFTER, IDLE_TIMEOUT, Limits, PONG_TIMEOUT, UNRESPONSIVE_AFTER,
+        WRITE_TIMEOUT,
+    };
     use std::sync::Arc;
     use std::time::{Duration, Instant};
     use tokio::io::{AsyncReadExt, AsyncWriteExt};
@@ -484,6 +499,27 @@ mod tests {
             assert!(half_open.read_u8().await.is_err(), "the serving task sees the end");
             drop(half_open);
             assert_eq!(port.admission.n_open(), 4);
+        });
+    }
+
+    #[test]
+    fn downloads_are_not_idle() {
+        run(async {
+            let port = Port::open();
+            let (mut downloading, mut peer) = port.connect();
+            let (idle, _b) = port.connect();
+            downloading.connection().requested();
+            idle.connection().requested();
+            let requested = Instant::now();
+            tokio::time::sleep(Duration::from_millis(50)).await;
+            downloading.write_all(b"the next bytes of a mesh").await.expect("the peer reads");
+            assert_eq!(peer.read_u8().await.expect("a byte"), b't');
+            assert!(idle.connection().timeout_reason(requested + IDLE_TIMEOUT + Duration::from_millis(10)).is_some());
+            let connection = downloading.connection();
+            assert_eq!(connection.timeout_reason(requested + IDLE_TIMEOUT + Duration::from_millis(10)), None);
+            assert!(connection.timeout_reason(Instant::now() + IDLE_TIMEOUT + Duration::from_millis(10)).is_some());
+            assert!(port.admission.evict());
+            assert!(is_closed(&idle) && !is_closed(&downloading), "the connection in use stays");
         });
     }
 

@@ -2,7 +2,7 @@
 
 use crate::Hub;
 use crate::clock::ServerClock;
-use crate::hub::Demand;
+use crate::hub::{Demand, LiveImages};
 use crate::keyframe_log::KeyframeLog;
 use crate::keyframe_points::pack_points;
 use crate::picture::pack_live_image;
@@ -23,6 +23,8 @@ const CHECK_PERIOD: Duration = Duration::from_millis(20);
 const STATUS_PERIOD: Duration = Duration::from_millis(100);
 /// Minimum period between versions of the keyframe list.
 const KEYFRAMES_PERIOD: Duration = Duration::from_millis(200);
+/// Maximum number of images of a camera that are encoded at the same time. Clients may want many different sizes.
+const MAX_IMAGE_ENCODINGS: usize = 4;
 /// Minimum period between complete keyframe lists, which are long.
 const KEYFRAME_LIST_PERIOD: Duration = Duration::from_millis(950);
 
@@ -56,8 +58,10 @@ impl LatestMessages {
         self.scene.is_none()
             && self.status.is_none()
             && self.robot.is_none()
+            && self.keyframe_list.is_none()
             && self.keyframe_log.is_none()
             && self.live_images.is_empty()
+            && self.keyframe_points.is_empty()
     }
 }
 
@@ -90,7 +94,8 @@ pub(crate) async fn broadcast(hub: Hub, clock: ServerClock, latest_messages_send
     let mut keyframe_log = KeyframeLog::default();
     let mut is_list_outdated = true;
     let mut is_encoding_list = false;
-    let mut is_encoding_points = false;
+    // Task and keyframe of the points that are being packed.
+    let mut points_encoding: Option<(tokio::task::Id, u64)> = None;
     let mut image_encodings: BTreeMap<ImageKey, ImageEncoding> = BTreeMap::new();
     let mut encodings: JoinSet<Encoded> = JoinSet::new();
     let mut n_items = 0;
@@ -119,15 +124,22 @@ pub(crate) async fn broadcast(hub: Hub, clock: ServerClock, latest_messages_send
                     });
                 }
                 Ok(Encoded::Points(number, message)) => {
-                    is_encoding_points = false;
+                    points_encoding = None;
                     publish_item(&|latest_messages, _| {
                         latest_messages.keyframe_points.insert(number, message.clone());
                     });
                 }
                 Err(error) => {
                     log::error!("cannot encode a message for clients: {error}");
-                    // It is not known which message failed, so all kinds may be encoded again when they change.
-                    (is_encoding_list, is_encoding_points) = (false, false);
+                    if let Some((_, number)) = points_encoding.take_if(|(task, _)| *task == error.id()) {
+                        // Another attempt would fail, too.
+                        publish_item(&|latest_messages, _| {
+                            latest_messages.keyframe_points.insert(number, None);
+                        });
+                        continue;
+                    }
+                    // It is not known which message failed, so both kinds may be encoded again when they change.
+                    is_encoding_list = false;
                     image_encodings.values_mut().for_each(|image_encoding| image_encoding.is_running = false);
                 }
             },
@@ -148,7 +160,8 @@ pub(crate) async fn broadcast(hub: Hub, clock: ServerClock, latest_messages_send
             list_sent.reset();
             continue;
         }
-        let demands = hub.demands();
+        let now = Instant::now();
+        let demands: Vec<_> = hub.demands().into_iter().filter(|demand| demand.settles_at(now).is_none()).collect();
         if let Some(hint) = take_if_changed(&mut scene).flatten() {
             let message = text(&ServerMessage::from(&*hint));
             publish_item(&|latest_messages, number| {
@@ -193,16 +206,16 @@ pub(crate) async fn broadcast(hub: Hub, clock: ServerClock, latest_messages_send
             });
         }
         let needs_points = demands.iter().any(|demand| demand.subscriptions.keyframe_points.is_some());
-        if needs_points && !is_encoding_points {
+        if needs_points && points_encoding.is_none() {
             let latest = latest_messages_sender.borrow();
             let next = keyframe_log.newest_first().find(|(number, _)| !latest.keyframe_points.contains_key(number));
             if let Some((number, pose)) = next {
-                is_encoding_points = true;
                 let source = hub.keyframe_source(&pose.camera, pose.stamp);
-                encodings.spawn_blocking(move || {
+                let task = encodings.spawn_blocking(move || {
                     let packed = source.and_then(|keyframe| pack_points(number, &keyframe));
                     Encoded::Points(number, packed.map(Message::binary))
                 });
+                points_encoding = Some((task.id(), number));
             }
         }
         let wanted = wanted_images(&demands, live_images.borrow().keys());
@@ -212,21 +225,14 @@ pub(crate) async fn broadcast(hub: Hub, clock: ServerClock, latest_messages_send
         if latest_messages_sender.borrow().live_images.keys().any(is_unwanted) {
             latest_messages_sender.send_modify(|latest| latest.live_images.retain(|key, _| wanted.contains_key(key)));
         }
-        for (key, period) in wanted {
-            let Some(image) = live_images.borrow().get(&key.0).cloned() else { continue };
-            let is_new = image_encodings.get(&key).is_none_or(|image_encoding| {
-                !image_encoding.is_running
-                    && image_encoding.at.elapsed() >= period
-                    && !Arc::ptr_eq(&image_encoding.image, &image)
+        let images = images_to_encode(wanted, &image_encodings, &live_images.borrow());
+        for (key, image) in images {
+            let entry = ImageEncoding { image: Arc::clone(&image), at: Instant::now(), is_running: true };
+            image_encodings.insert(key.clone(), entry);
+            encodings.spawn_blocking(move || {
+                let message = live_message(&image, key.1, clock);
+                Encoded::LiveImage(key, message)
             });
-            if is_new {
-                let entry = ImageEncoding { image: Arc::clone(&image), at: Instant::now(), is_running: true };
-                image_encodings.insert(key.clone(), entry);
-                encodings.spawn_blocking(move || {
-                    let message = live_message(&image, key.1, clock);
-                    Encoded::LiveImage(key, message)
-                });
-            }
         }
     }
 }
@@ -246,6 +252,34 @@ fn wanted_images<'a>(
         }
     }
     wanted
+}
+
+/// The new images whose encoding can begin now. If a camera's images are wanted in many sizes, those come first that were
+/// encoded longest ago.
+fn images_to_encode(
+    wanted: BTreeMap<ImageKey, Duration>,
+    image_encodings: &BTreeMap<ImageKey, ImageEncoding>,
+    live_images: &LiveImages,
+) -> Vec<(ImageKey, Arc<LiveImage>)> {
+    let mut n_running: BTreeMap<Arc<str>, usize> = BTreeMap::new();
+    for ((camera, _), _) in image_encodings.iter().filter(|(_, encoding)| encoding.is_running) {
+        *n_running.entry(Arc::clone(camera)).or_default() += 1;
+    }
+    let mut wanted: Vec<_> = wanted.into_iter().collect();
+    wanted.sort_by_key(|(key, _)| image_encodings.get(key).map(|encoding| encoding.at));
+    let to_encode = wanted.into_iter().filter_map(|(key, period)| {
+        let image = live_images.get(&key.0)?;
+        let is_new = image_encodings.get(&key).is_none_or(|encoding| {
+            !encoding.is_running && encoding.at.elapsed() >= period && !Arc::ptr_eq(&encoding.image, image)
+        });
+        let n_running = n_running.entry(Arc::clone(&key.0)).or_default();
+        if !is_new || *n_running >= MAX_IMAGE_ENCODINGS {
+            return None;
+        }
+        *n_running += 1;
+        Some((key, Arc::clone(image)))
+    });
+    to_encode.collect()
 }
 
 fn live_message(image: &LiveImage, max_px: [u32; 2], clock: ServerClock) -> Message {
@@ -289,5 +323,55 @@ impl Throttle {
 
     fn reset(&mut self) {
         self.last = None;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{ImageEncoding, ImageKey, MAX_IMAGE_ENCODINGS, images_to_encode};
+    use crate::updates::{LiveImage, LivePixels};
+    use kinematics::Stamp;
+    use std::collections::{BTreeMap, BTreeSet};
+    use std::sync::Arc;
+    use std::time::{Duration, Instant};
+
+    fn image(camera: &str) -> (Arc<str>, Arc<LiveImage>) {
+        let image = LiveImage {
+            camera: camera.into(),
+            stamp: Stamp(1),
+            captured_at: Instant::now(),
+            size_px: [8, 8],
+            pixels: LivePixels::Rgb(vec![0; 192].into()),
+            world_from_camera: None,
+            focal_px: [8.0; 2],
+            principal_px: [4.0; 2],
+        };
+        (Arc::clone(&image.camera), Arc::new(image))
+    }
+
+    #[test]
+    fn many_sizes_are_encoded_in_turn() {
+        let sizes = (1..=10).map(|n| [16 * n; 2]);
+        let wanted: BTreeMap<ImageKey, Duration> = sizes
+            .map(|size_px| (("left".into(), size_px), Duration::ZERO))
+            .chain([(("right".into(), [16; 2]), Duration::ZERO)])
+            .collect();
+        let mut encodings: BTreeMap<ImageKey, ImageEncoding> = BTreeMap::new();
+        let mut encoded = BTreeSet::new();
+        for round in 0..3 {
+            // The cameras have new images.
+            let images = [image("left"), image("right")].into();
+            let started = images_to_encode(wanted.clone(), &encodings, &images);
+            let n_left = started.iter().filter(|((camera, _), _)| &**camera == "left").count();
+            assert_eq!((n_left, started.len()), (MAX_IMAGE_ENCODINGS, MAX_IMAGE_ENCODINGS + 1), "round {round}");
+            for (key, image) in started {
+                encoded.insert(key.clone());
+                encodings.insert(key, ImageEncoding { image, at: Instant::now(), is_running: true });
+            }
+            let images = [image("left"), image("right")].into();
+            assert!(images_to_encode(wanted.clone(), &encodings, &images).is_empty(), "all slots are in use");
+            encodings.values_mut().for_each(|encoding| encoding.is_running = false);
+        }
+        assert_eq!(encoded.len(), wanted.len(), "no size has to wait longer");
     }
 }

@@ -1,6 +1,7 @@
 //! Decides which update a client receives next, according to its subscriptions.
 
 use crate::broadcast::{Item, LatestMessages};
+use crate::keyframe_log::{Changes, ListPosition};
 use crate::subscriptions::Subscriptions;
 use axum::extract::ws::Message;
 use std::collections::{BTreeMap, BTreeSet};
@@ -14,13 +15,19 @@ pub(crate) struct ClientUpdates {
     robot: u64,
     status: Sent,
     keyframe_list: Sent,
-    keyframe_changes: Sent,
+    keyframe_changes: ListPosition,
+    /// When the client's list was last up to date.
+    keyframe_changes_at: Option<Instant>,
     /// Number of the subscription to keyframes that the list belongs to.
     n_keyframe_lists: u64,
     live_images: BTreeMap<Arc<str>, Sent>,
+    /// Whether the last long message was a live image.
+    was_image: bool,
     /// Numbers of the keyframes whose points were sent, and the time of the last ones.
     keyframe_points: BTreeSet<u64>,
-    points_sent: Sent,
+    keyframe_points_at: Option<Instant>,
+    /// Number of the subscription to points that these points belong to.
+    n_point_subscriptions: u64,
 }
 
 /// Number of the last item of a kind, and when it was sent.
@@ -43,10 +50,20 @@ pub(crate) enum Next {
     Wait,
 }
 
-impl Sent {
-    /// When the next item may be sent.
-    fn due(self, period: Duration, now: Instant) -> Instant {
-        self.at.and_then(|at| at.checked_add(period)).unwrap_or(now)
+/// Decides which items are due, and remembers when the next one is.
+struct Timer {
+    now: Instant,
+    earliest: Option<Instant>,
+}
+
+impl Timer {
+    /// Whether an item may be sent after this period since the last one.
+    fn is_due(&mut self, last: Option<Instant>, period: Duration) -> bool {
+        let due = last.and_then(|at| at.checked_add(period)).unwrap_or(self.now);
+        if due > self.now {
+            self.earliest = Some(self.earliest.map_or(due, |earliest| earliest.min(due)));
+        }
+        due <= self.now
     }
 }
 
@@ -60,91 +77,144 @@ impl ClientUpdates {
         now: Instant,
         allows_long: bool,
     ) -> Next {
-        let mut earliest: Option<Instant> = None;
-        let mut is_due = |sent: Sent, period: Duration| {
-            let due = sent.due(period, now);
-            if due > now {
-                earliest = Some(earliest.map_or(due, |earliest| earliest.min(due)));
+        let mut timer = Timer { now, earliest: None };
+        if let Some(message) = self.next_short(latest, subscriptions, &mut timer) {
+            return Next::Short(message);
+        }
+        self.restart(subscriptions);
+        if allows_long {
+            // Images and keyframes alternate, so that neither delays the other for long.
+            for is_image in [!self.was_image, self.was_image] {
+                let message = if is_image {
+                    self.next_image(latest, subscriptions, &mut timer)
+                } else if has_keyframe_changes {
+                    self.next_changes(latest, subscriptions, &mut timer)
+                        .or_else(|| self.next_points(latest, subscriptions, &mut timer))
+                } else {
+                    self.next_list(latest, subscriptions, &mut timer)
+                };
+                if let Some(message) = message {
+                    self.was_image = is_image;
+                    return Next::Long(message);
+                }
             }
-            due <= now
-        };
+        }
+        timer.earliest.map_or(Next::Wait, Next::WaitUntil)
+    }
+
+    /// Whether the robot was sent. States without it cannot be drawn.
+    pub(crate) fn has_robot(&self) -> bool {
+        self.robot > 0
+    }
+
+    fn next_short(
+        &mut self,
+        latest: &LatestMessages,
+        subscriptions: &Subscriptions,
+        timer: &mut Timer,
+    ) -> Option<Message> {
         if let Some(scene) = newer(latest.scene.as_ref(), &mut self.scene) {
-            return Next::Short(scene);
+            return Some(scene);
         }
         if let (Some(period), Some(item)) = (subscriptions.status, &latest.status)
             && item.number > self.status.number
-            && is_due(self.status, period)
+            && timer.is_due(self.status.at, period)
         {
-            self.status = Sent { number: item.number, at: Some(now) };
-            return Next::Short(item.message.clone());
+            self.status = Sent { number: item.number, at: Some(timer.now) };
+            return Some(item.message.clone());
         }
-        if subscriptions.robot_state.is_some()
-            && let Some(robot) = newer(latest.robot.as_ref(), &mut self.robot)
-        {
-            return Next::Short(robot);
-        }
-        if allows_long {
-            // The camera whose last image was sent longest ago comes first.
-            let waiting = latest.live_images.iter().filter_map(|((camera, max_px), item)| {
-                let subscription = subscriptions.images_of(camera);
-                let sent = self.live_images.get(camera).copied().unwrap_or_default();
-                let is_wanted = *max_px == subscription.max_px && item.number > sent.number;
-                let is_next = is_wanted && is_due(sent, subscription.period?);
-                is_next.then_some((sent.number, camera, item))
-            });
-            if let Some((_, camera, item)) = waiting.min_by_key(|(number, ..)| *number) {
-                self.live_images.insert(Arc::clone(camera), Sent { number: item.number, at: Some(now) });
-                return Next::Long(item.message.clone());
-            }
-            if subscriptions.n_keyframe_lists > self.n_keyframe_lists {
-                // A new subscription begins with the complete list.
-                self.n_keyframe_lists = subscriptions.n_keyframe_lists;
-                (self.keyframe_list, self.keyframe_changes) = (Sent::default(), Sent::default());
-            }
-            if let Some(period) = subscriptions.keyframes {
-                if !has_keyframe_changes
-                    && let Some(item) = &latest.keyframe_list
-                    && item.number > self.keyframe_list.number
-                    && is_due(self.keyframe_list, period)
-                {
-                    self.keyframe_list = Sent { number: item.number, at: Some(now) };
-                    return Next::Long(item.message.clone());
-                }
-                if has_keyframe_changes
-                    && let Some(log) = &latest.keyframe_log
-                    && log.version() != self.keyframe_changes.number
-                    && is_due(self.keyframe_changes, period)
-                    && let Some((json, version)) = log.next_changes(self.keyframe_changes.number)
-                {
-                    // The parts of a long list follow each other.
-                    let at = (version == log.version()).then_some(now);
-                    self.keyframe_changes = Sent { number: version, at };
-                    return Next::Long(Message::text(json));
-                }
-            }
-            match subscriptions.keyframe_points {
-                // The client has the keyframes, in whose frames the points are, before their points.
-                Some(period) if has_keyframe_changes && is_due(self.points_sent, period) => {
-                    if let Some(points) = self.next_points(latest) {
-                        self.points_sent = Sent { number: 0, at: Some(now) };
-                        return Next::Long(points);
-                    }
-                }
-                Some(_) => {}
-                None => self.keyframe_points.clear(),
-            }
-        }
-        earliest.map_or(Next::Wait, Next::WaitUntil)
+        subscriptions.robot_state.and_then(|_| newer(latest.robot.as_ref(), &mut self.robot))
     }
 
-    /// The points of the newest keyframe that the client does not have.
-    fn next_points(&mut self, latest: &LatestMessages) -> Option<Message> {
+    /// Forgets what was sent for earlier subscriptions: new ones begin with the complete list, and with all points.
+    fn restart(&mut self, subscriptions: &Subscriptions) {
+        if subscriptions.n_keyframe_lists > self.n_keyframe_lists {
+            self.n_keyframe_lists = subscriptions.n_keyframe_lists;
+            self.keyframe_list = Sent::default();
+            (self.keyframe_changes, self.keyframe_changes_at) = (ListPosition::default(), None);
+        }
+        if subscriptions.n_point_subscriptions > self.n_point_subscriptions {
+            self.n_point_subscriptions = subscriptions.n_point_subscriptions;
+            self.keyframe_points.clear();
+        }
+    }
+
+    /// The image of the camera whose last image was sent longest ago.
+    fn next_image(
+        &mut self,
+        latest: &LatestMessages,
+        subscriptions: &Subscriptions,
+        timer: &mut Timer,
+    ) -> Option<Message> {
+        let waiting = latest.live_images.iter().filter_map(|((camera, max_px), item)| {
+            let subscription = subscriptions.images_of(camera);
+            let sent = self.live_images.get(camera).copied().unwrap_or_default();
+            let is_wanted = *max_px == subscription.max_px && item.number > sent.number;
+            let is_next = is_wanted && timer.is_due(sent.at, subscription.period?);
+            is_next.then_some((sent.number, camera, item))
+        });
+        let (_, camera, item) = waiting.min_by_key(|(number, ..)| *number)?;
+        self.live_images.insert(Arc::clone(camera), Sent { number: item.number, at: Some(timer.now) });
+        Some(item.message.clone())
+    }
+
+    /// The complete list of keyframes.
+    fn next_list(
+        &mut self,
+        latest: &LatestMessages,
+        subscriptions: &Subscriptions,
+        timer: &mut Timer,
+    ) -> Option<Message> {
+        let item = latest.keyframe_list.as_ref().filter(|item| item.number > self.keyframe_list.number)?;
+        if !timer.is_due(self.keyframe_list.at, subscriptions.keyframes?) {
+            return None;
+        }
+        self.keyframe_list = Sent { number: item.number, at: Some(timer.now) };
+        Some(item.message.clone())
+    }
+
+    /// Changes of the list of keyframes.
+    fn next_changes(
+        &mut self,
+        latest: &LatestMessages,
+        subscriptions: &Subscriptions,
+        timer: &mut Timer,
+    ) -> Option<Message> {
+        let log = latest.keyframe_log.as_ref().filter(|log| !log.is_up_to_date(self.keyframe_changes))?;
+        if !timer.is_due(self.keyframe_changes_at, subscriptions.keyframes?) {
+            return None;
+        }
+        let Changes { json, position, is_new_list } = log.next_changes(self.keyframe_changes)?;
+        if is_new_list {
+            // Clients discard points together with their keyframes.
+            self.keyframe_points.clear();
+        }
+        // The parts of a long list follow each other.
+        self.keyframe_changes_at = log.is_up_to_date(position).then_some(timer.now);
+        self.keyframe_changes = position;
+        Some(Message::text(json))
+    }
+
+    /// The points of the newest keyframe that the client has without points.
+    fn next_points(
+        &mut self,
+        latest: &LatestMessages,
+        subscriptions: &Subscriptions,
+        timer: &mut Timer,
+    ) -> Option<Message> {
+        let period = subscriptions.keyframe_points?;
+        let log = latest.keyframe_log.as_ref()?;
         self.keyframe_points.retain(|number| latest.keyframe_points.contains_key(number));
         let mut newest_first = latest.keyframe_points.iter().rev();
         let (number, message) = newest_first.find_map(|(number, message)| {
-            Some((number, message.as_ref()?)).filter(|_| !self.keyframe_points.contains(number))
+            let is_next = !self.keyframe_points.contains(number) && log.is_sent(*number, self.keyframe_changes);
+            Some((number, message.as_ref()?)).filter(|_| is_next)
         })?;
+        if !timer.is_due(self.keyframe_points_at, period) {
+            return None;
+        }
         self.keyframe_points.insert(*number);
+        self.keyframe_points_at = Some(timer.now);
         Some(message.clone())
     }
 }
@@ -160,10 +230,15 @@ fn newer(item: Option<&Item>, number: &mut u64) -> Option<Message> {
 mod tests {
     use super::{ClientUpdates, Next};
     use crate::broadcast::{Item, LatestMessages};
+    use crate::keyframe_log::KeyframeLog;
     use crate::protocol::SubscribeMessage;
     use crate::subscriptions::Subscriptions;
+    use crate::updates::KeyframePose;
     use axum::extract::ws::Message;
+    use kinematics::{Stamp, Transform};
     use serde_json::{Value, json};
+    use std::collections::BTreeSet;
+    use std::sync::Arc;
     use std::time::{Duration, Instant};
 
     const DEFAULT_PX: [u32; 2] = [640, u32::MAX];
@@ -208,10 +283,10 @@ mod tests {
         assert_eq!(client.next(&latest, false), None, "only long messages are left");
         assert_eq!(client.next(&latest, true).as_deref(), Some("3"));
         latest.live_images.insert(("left".into(), DEFAULT_PX), item(6));
+        assert_eq!(client.next(&latest, true).as_deref(), Some("2"), "keyframes come after at most one image");
         assert_eq!(client.next(&latest, true).as_deref(), Some("5"), "the other camera comes next");
         client.now += Duration::from_millis(200);
         assert_eq!(client.next(&latest, true).as_deref(), Some("6"));
-        assert_eq!(client.next(&latest, true).as_deref(), Some("2"));
         assert_eq!(client.next(&latest, true), None);
     }
 
@@ -220,11 +295,11 @@ mod tests {
         let mut latest = LatestMessages::default();
         let mut client = Client::new();
         client.subscribe(json!({"topic": "status", "rate_hz": 2}));
-        client.subscribe(json!({"topic": "live_images", "rate_hz": 10, "size_px": [200, 200]}));
+        client.subscribe(json!({"topic": "live_images", "rate_hz": 10, "size_px": [192, 192]}));
         let (mut n_status, mut n_images) = (0, 0);
         for tick in 0..200_u64 {
             latest.status = Some(item(3 * tick + 1));
-            latest.live_images.insert(("left".into(), [200, 200]), item(3 * tick + 2));
+            latest.live_images.insert(("left".into(), [192, 192]), item(3 * tick + 2));
             // An image of a size for another client.
             latest.live_images.insert(("left".into(), DEFAULT_PX), item(3 * tick + 3));
             while let Some(sent) = client.next(&latest, true) {
@@ -265,5 +340,139 @@ mod tests {
         client.subscribe(json!({"topic": "robot_state", "rate_hz": 60}));
         assert_eq!(client.next(&latest, true).as_deref(), Some("1"));
         assert_eq!(client.next(&latest, true), None);
+    }
+
+    fn keyframes(n: i64) -> Vec<KeyframePose> {
+        let keyframe = |ix| KeyframePose {
+            camera: "wrist".into(),
+            stamp: Stamp(ix),
+            world_from_camera: Transform::identity(),
+            size_px: [640, 480],
+            focal_px: [600.0; 2],
+            principal_px: [320.0, 240.0],
+        };
+        (0..n).map(keyframe).collect()
+    }
+
+    /// A client that draws keyframes and their points, with the numbers that it has.
+    struct PointsClient {
+        client: Client,
+        log: KeyframeLog,
+        latest: LatestMessages,
+        keyframes: BTreeSet<u64>,
+        points: BTreeSet<u64>,
+        /// Numbers of points that came without their keyframe.
+        n_dropped: usize,
+    }
+
+    impl PointsClient {
+        fn new() -> Self {
+            let mut client = Client::new();
+            client.subscribe(json!({"topic": "keyframes", "rate_hz": 2}));
+            client.subscribe(json!({"topic": "keyframe_points", "rate_hz": 20}));
+            Self {
+                client,
+                log: KeyframeLog::default(),
+                latest: LatestMessages::default(),
+                keyframes: BTreeSet::new(),
+                points: BTreeSet::new(),
+                n_dropped: 0,
+            }
+        }
+
+        /// Sets a list of this many keyframes, all with points.
+        fn set_keyframes(&mut self, n: i64) {
+            self.log.set(&keyframes(n));
+            let points = |number: u64| (number, Some(Message::text(number.to_string())));
+            self.latest.keyframe_points = self.log.newest_first().map(|(number, _)| points(number)).collect();
+            self.latest.keyframe_log = Some(Arc::new(self.log.clone()));
+        }
+
+        fn next(&mut self) -> Next {
+            let Client { updates, subscriptions, now } = &mut self.client;
+            updates.next(&self.latest, subscriptions, true, *now, true)
+        }
+
+        /// Receives what is sent within a time. Like the page, drops points without a keyframe.
+        fn receive(&mut self, millis: u64) {
+            for _ in 0..millis / 10 {
+                while let Next::Short(message) | Next::Long(message) = self.next() {
+                    self.apply(&message.into_text().expect("text"));
+                }
+                self.client.now += Duration::from_millis(10);
+            }
+        }
+
+        fn apply(&mut self, text: &str) {
+            match serde_json::from_str(text).expect("JSON") {
+                Value::Number(number) => {
+                    let number = number.as_u64().expect("an integer");
+                    if self.keyframes.contains(&number) {
+                        self.points.insert(number);
+                    } else {
+                        self.n_dropped += 1;
+                    }
+                }
+                changes => {
+                    if changes["from_version"] == 0 {
+                        self.keyframes.clear();
+                    }
+                    let list = |name: &str| changes[name].as_array().expect("a list").clone();
+                    self.keyframes.extend(list("keyframes").iter().filter_map(|keyframe| keyframe["id"].as_u64()));
+                    for number in list("removed").iter().filter_map(Value::as_u64) {
+                        self.keyframes.remove(&number);
+                    }
+                    self.points.retain(|number| self.keyframes.contains(number));
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn points_come_after_their_keyframes() {
+        let mut viewer = PointsClient::new();
+        for n in 1..=60 {
+            viewer.set_keyframes(n);
+            viewer.receive(100);
+        }
+        viewer.receive(1000);
+        assert_eq!((viewer.keyframes.len(), viewer.points.len(), viewer.n_dropped), (60, 60, 0));
+    }
+
+    #[test]
+    fn new_lists_and_subscriptions_bring_all_points_again() {
+        let mut viewer = PointsClient::new();
+        viewer.set_keyframes(50);
+        viewer.receive(4000);
+        assert_eq!(viewer.points.len(), 50);
+        viewer.client.subscribe(json!({"topic": "keyframes", "rate_hz": 2}));
+        viewer.receive(4000);
+        assert_eq!((viewer.keyframes.len(), viewer.points.len()), (50, 50), "after a new list");
+        // Off and on again, faster than the server looks.
+        viewer.points.clear();
+        viewer.client.subscribe(json!({"topic": "keyframe_points", "rate_hz": 0}));
+        viewer.client.subscribe(json!({"topic": "keyframe_points", "rate_hz": 20}));
+        viewer.receive(4000);
+        assert_eq!((viewer.points.len(), viewer.n_dropped), (50, 0), "after a new subscription");
+    }
+
+    #[test]
+    fn keyframes_are_sent_between_images() {
+        let mut viewer = PointsClient::new();
+        viewer.client.subscribe(json!({"topic": "live_images", "rate_hz": 100}));
+        viewer.set_keyframes(200);
+        let mut n_images = 0_u64;
+        while viewer.keyframes.len() < 200 {
+            // The link is so slow that a new image always waits.
+            viewer.client.now += Duration::from_millis(200);
+            viewer.latest.live_images.insert(("left".into(), DEFAULT_PX), item(1 + n_images));
+            match viewer.next() {
+                Next::Long(message) if message == item(1 + n_images).message => n_images += 1,
+                Next::Long(message) => viewer.apply(&message.into_text().expect("text")),
+                other => panic!("{other:?} instead of a message"),
+            }
+            assert!(n_images <= 20, "only {} keyframes after {n_images} images", viewer.keyframes.len());
+        }
+        assert!(n_images >= 6, "images are sent, too");
     }
 }

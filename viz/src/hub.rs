@@ -30,13 +30,33 @@ pub(crate) type LiveImages = BTreeMap<Arc<str>, Arc<LiveImage>>;
 /// Keyframes by camera and stamp.
 type KeyframeSources = BTreeMap<(Arc<str>, i64), Weak<Keyframe>>;
 
+/// A client gets keyframes and images this long after it has joined, or after its hello. Earlier, it is not known which
+/// of them it wants, and at which size.
+const HELLO_GRACE: Duration = Duration::from_millis(500);
+
 /// What a client receives.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Debug)]
 pub(crate) struct Demand {
+    joined: Instant,
+    /// Whether it has sent a hello.
+    pub(crate) has_hello: bool,
     /// Its subscriptions.
     pub(crate) subscriptions: Arc<Subscriptions>,
     /// Whether it receives only the changes of the keyframe list.
     pub(crate) has_keyframe_changes: bool,
+}
+
+impl Demand {
+    /// The demand of a client that has sent nothing.
+    pub(crate) fn new(joined: Instant) -> Self {
+        Self { joined, has_hello: false, subscriptions: Arc::default(), has_keyframe_changes: false }
+    }
+
+    /// The time from which the client gets keyframes and images, if it is later.
+    pub(crate) fn settles_at(&self, now: Instant) -> Option<Instant> {
+        let settled = self.joined + HELLO_GRACE;
+        (!self.has_hello && settled > now).then_some(settled)
+    }
 }
 
 #[derive(Debug, Default)]
@@ -127,6 +147,11 @@ impl Hub {
         self.shared.robot_state.send_replace(Some(Arc::new(state)));
     }
 
+    /// Whether a client shows the images of any camera.
+    pub fn needs_live_images(&self) -> bool {
+        self.shared.demands.lock().values().any(|demand| demand.subscriptions.has_live_images())
+    }
+
     /// Whether a client draws the robot.
     pub fn needs_robot_state(&self) -> bool {
         self.shared.demands.lock().values().any(|demand| demand.subscriptions.robot_state.is_some())
@@ -175,7 +200,7 @@ impl Hub {
 
     pub(crate) fn join(&self) -> (u64, Arc<Notify>) {
         let (client, wake) = self.queue().join();
-        self.set_demand(client, Demand::default());
+        self.set_demand(client, Demand::new(Instant::now()));
         (client, wake)
     }
 

@@ -32,8 +32,33 @@ type Key = (Arc<str>, i64, u32);
 
 #[derive(Clone, Debug)]
 struct Entry {
+    /// Version that added the keyframe.
+    added: u64,
+    /// Version that changed it last.
     changed: u64,
     keyframe: KeyframePose,
+}
+
+/// How much of the list a client has received.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(crate) struct ListPosition {
+    /// The client has received the changes up to this version; 0 without a list.
+    version: u64,
+    /// Version of the log when the client's list was started.
+    began: u64,
+    /// Newest version that the client's list has matched; 0 until the list is complete.
+    complete: u64,
+}
+
+/// The next message for a client.
+#[derive(Clone, Debug)]
+pub(crate) struct Changes {
+    /// The message.
+    pub(crate) json: String,
+    /// What the client has after the message.
+    pub(crate) position: ListPosition,
+    /// Whether the message replaces the client's list.
+    pub(crate) is_new_list: bool,
 }
 
 impl Default for KeyframeLog {
@@ -51,9 +76,16 @@ impl Default for KeyframeLog {
 }
 
 impl KeyframeLog {
-    /// Number of changes so far, plus 1.
-    pub(crate) fn version(&self) -> u64 {
-        self.version
+    /// Whether a client at this position has all changes.
+    pub(crate) fn is_up_to_date(&self, position: ListPosition) -> bool {
+        position.version == self.version
+    }
+
+    /// Whether a client at this position certainly has the keyframe with this number.
+    pub(crate) fn is_sent(&self, number: u64, position: ListPosition) -> bool {
+        // Keyframes that have changed since the list was complete still count as sent.
+        let is_sent = |entry: &Entry| entry.changed <= position.version || entry.added <= position.complete;
+        self.keyframes.get(&number).is_some_and(is_sent)
     }
 
     /// Whether the list has a keyframe with this number.
@@ -78,9 +110,11 @@ impl KeyframeLog {
                 self.n_added += 1;
                 self.n_added
             });
-            if self.keyframes.get(&number).is_none_or(|entry| has_changed(&entry.keyframe, keyframe)) {
+            let before = self.keyframes.get(&number);
+            if before.is_none_or(|entry| has_changed(&entry.keyframe, keyframe)) {
                 self.version += 1;
-                let entry = Entry { changed: self.version, keyframe: keyframe.clone() };
+                let added = before.map_or(self.version, |entry| entry.added);
+                let entry = Entry { added, changed: self.version, keyframe: keyframe.clone() };
                 self.keyframes.insert(number, entry);
             }
             numbers.insert(key, number);
@@ -96,10 +130,13 @@ impl KeyframeLog {
         }
     }
 
-    /// The next message for a client that has this version of the list, as JSON with the version that it then has;
-    /// `None` if it is up to date. A message from version 0 replaces the client's list.
-    pub(crate) fn next_changes(&self, version: u64) -> Option<(String, u64)> {
-        let from_version = if version < self.forgotten || version > self.version { 0 } else { version };
+    /// The next message for a client at this position; `None` if it is up to date. A message from version 0 replaces
+    /// the client's list.
+    pub(crate) fn next_changes(&self, position: ListPosition) -> Option<Changes> {
+        // A list does not contain keyframes that were removed before it was started, so it needs only later removals.
+        let is_outdated = position.version.max(position.began) < self.forgotten || position.version > self.version;
+        let position = if is_outdated { ListPosition::default() } else { position };
+        let from_version = position.version;
         if from_version == self.version {
             return None;
         }
@@ -114,7 +151,11 @@ impl KeyframeLog {
         let keyframes = keyframes.map(|(number, entry)| NumberedKeyframe::new(*number, &entry.keyframe)).collect();
         let is_new = |(at, _): &&(u64, u64)| from_version > 0 && *at > from_version && *at <= version;
         let removed = self.removals.iter().filter(is_new).map(|(_, number)| *number).collect();
-        Some((ServerMessage::KeyframeChanges { from_version, version, keyframes, removed }.to_json(), version))
+        let is_new_list = from_version == 0;
+        let began = if is_new_list { self.version } else { position.began };
+        let complete = if version == self.version { version } else { position.complete };
+        let json = ServerMessage::KeyframeChanges { from_version, version, keyframes, removed }.to_json();
+        Some(Changes { json, position: ListPosition { version, began, complete }, is_new_list })
     }
 }
 
@@ -127,7 +168,7 @@ fn has_changed(before: &KeyframePose, after: &KeyframePose) -> bool {
 
 #[cfg(test)]
 mod tests {
-    use super::{KeyframeLog, MAX_REMOVALS};
+    use super::{Changes, KeyframeLog, ListPosition, MAX_REMOVALS};
     use crate::protocol::MAX_CHANGED_KEYFRAMES;
     use crate::updates::KeyframePose;
     use kinematics::random::Random;
@@ -149,7 +190,7 @@ mod tests {
     /// A client's list: stamp and x by number.
     #[derive(Default)]
     struct Replica {
-        version: u64,
+        position: ListPosition,
         keyframes: BTreeMap<u64, (i64, f64)>,
         n_received: usize,
     }
@@ -157,26 +198,42 @@ mod tests {
     impl Replica {
         /// Applies all messages, as `docs/reference/protocol.md` says.
         fn update(&mut self, log: &KeyframeLog) {
-            while let Some((json, version)) = log.next_changes(self.version) {
-                let message: Value = serde_json::from_str(&json).expect("JSON");
-                if message["from_version"] == 0 {
-                    self.keyframes.clear();
-                }
-                let list = |name: &str| message[name].as_array().expect("a list").clone();
-                assert!(list("keyframes").len() <= MAX_CHANGED_KEYFRAMES);
-                self.n_received += list("keyframes").len();
-                for keyframe in list("keyframes") {
-                    let number = keyframe["id"].as_u64().expect("a number");
-                    let stamp = keyframe["stamp_nanos"].as_i64().expect("a stamp");
-                    self.keyframes.insert(number, (stamp, keyframe["world_from_camera"][3].as_f64().expect("x")));
-                }
-                for number in list("removed") {
-                    self.keyframes.remove(&number.as_u64().expect("a number"));
-                }
-                assert_eq!(message["version"].as_u64(), Some(version));
-                assert!(version > self.version || message["from_version"] == 0, "no progress");
-                self.version = version;
+            let mut n_messages = 0;
+            while self.receive_one(log) {
+                n_messages += 1;
+                assert!(n_messages <= 200, "the messages do not end");
             }
+            assert!(log.is_up_to_date(self.position));
+        }
+
+        /// Applies the next message. Returns false if there is none.
+        fn receive_one(&mut self, log: &KeyframeLog) -> bool {
+            let Some(Changes { json, position, is_new_list }) = log.next_changes(self.position) else { return false };
+            let message: Value = serde_json::from_str(&json).expect("JSON");
+            assert_eq!(message["from_version"], if is_new_list { 0 } else { self.position.version });
+            if is_new_list {
+                self.keyframes.clear();
+            }
+            let list = |name: &str| message[name].as_array().expect("a list").clone();
+            assert!(list("keyframes").len() <= MAX_CHANGED_KEYFRAMES);
+            self.n_received += list("keyframes").len();
+            for keyframe in list("keyframes") {
+                let number = keyframe["id"].as_u64().expect("a number");
+                let stamp = keyframe["stamp_nanos"].as_i64().expect("a stamp");
+                self.keyframes.insert(number, (stamp, keyframe["world_from_camera"][3].as_f64().expect("x")));
+            }
+            for number in list("removed") {
+                self.keyframes.remove(&number.as_u64().expect("a number"));
+            }
+            assert_eq!(message["version"].as_u64(), Some(position.version));
+            assert!(position.version > self.position.version || is_new_list, "no progress");
+            self.position = position;
+            for (number, _) in log.newest_first() {
+                let (is_sent, has_it) = (log.is_sent(number, self.position), self.keyframes.contains_key(&number));
+                assert!(has_it || !is_sent, "keyframe {number} at {:?}", self.position);
+                assert!(is_sent || !log.is_up_to_date(self.position), "keyframe {number} at {:?}", self.position);
+            }
+            true
         }
 
         fn sorted(&self) -> Vec<(i64, f64)> {
@@ -244,8 +301,7 @@ mod tests {
         let mut replica = Replica::default();
         replica.update(&log);
         log.set(&[keyframe(3, 0.0)]);
-        let first: Value = serde_json::from_str(&log.next_changes(replica.version).expect("changes").0).expect("JSON");
-        assert_eq!(first["from_version"], 0);
+        assert!(log.next_changes(replica.position).expect("changes").is_new_list);
         replica.update(&log);
         assert_eq!(replica.sorted(), [(3, 0.0)]);
     }
@@ -253,9 +309,37 @@ mod tests {
     #[test]
     fn a_new_client_learns_that_the_list_is_empty() {
         let log = KeyframeLog::default();
-        let (json, version) = log.next_changes(0).expect("a message");
-        assert!(json.contains("\"keyframes\":[]"), "{json}");
-        assert!(log.next_changes(version).is_none());
+        let changes = log.next_changes(ListPosition::default()).expect("a message");
+        assert!(changes.json.contains("\"keyframes\":[]"), "{}", changes.json);
+        assert!(log.next_changes(changes.position).is_none());
+    }
+
+    #[test]
+    fn long_lists_end_after_many_removals() {
+        let mut log = KeyframeLog::default();
+        let list = |n: i64| (0..n).map(|ix| keyframe(ix, 0.0)).collect::<Vec<_>>();
+        log.set(&list(2000));
+        // The first messages of the remaining list end below the version of the forgotten removals.
+        log.set(&list(40));
+        let mut replica = Replica::default();
+        replica.update(&log);
+        assert_eq!((replica.keyframes.len(), replica.n_received), (40, 40));
+    }
+
+    #[test]
+    fn changes_during_a_long_list_do_not_count_as_sent() {
+        let mut log = KeyframeLog::default();
+        let list = |n: i64, x: f64| (0..n).map(|ix| keyframe(ix, x)).collect::<Vec<_>>();
+        log.set(&list(100, 0.0));
+        let mut replica = Replica::default();
+        // `receive_one` checks that only received keyframes count as sent.
+        for n_sent in 1..=20 {
+            let x = f64::from(n_sent);
+            log.set(&list(100 + 3 * i64::from(n_sent), if n_sent % 2 == 0 { x } else { x - 1.0 }));
+            assert!(replica.receive_one(&log));
+        }
+        replica.update(&log);
+        assert_eq!(replica.keyframes.len(), 160);
     }
 
     #[test]

@@ -12,7 +12,8 @@ const MAX_EDGE_FRAC: f64 = 0.05;
 
 /// The binary message with the points of a keyframe; `None` if it has no usable depth.
 pub(crate) fn pack_points(id: u64, keyframe: &Keyframe) -> Option<Vec<u8>> {
-    let (points, colors) = points_in_camera(keyframe, keyframe.depth.as_ref()?);
+    let is_complete = |depth: &&DepthMap| depth.depth_m.len() == n_pixels(depth.size_px);
+    let (points, colors) = points_in_camera(keyframe, keyframe.depth.as_ref().filter(is_complete)?);
     let extent_m = points.iter().flat_map(|point| point.coords.iter()).fold(0.0_f64, |max, value| max.max(value.abs()));
     if points.is_empty() || extent_m <= 0.0 {
         return None;
@@ -25,10 +26,14 @@ pub(crate) fn pack_points(id: u64, keyframe: &Keyframe) -> Option<Vec<u8>> {
     Some(frame(&BinaryHeader::KeyframePoints(header), &[&positions, &colors]))
 }
 
+fn n_pixels([width, height]: [u32; 2]) -> usize {
+    width as usize * height as usize
+}
+
 /// Points on a regular grid of the depth map, in the frame of the keyframe's color camera, and their colors.
 fn points_in_camera(keyframe: &Keyframe, depth: &DepthMap) -> (Vec<Point3<f64>>, Vec<u8>) {
     let [width, height] = depth.size_px;
-    let n_px = width as usize * height as usize;
+    let n_px = n_pixels(depth.size_px);
     let stride = (1..).find(|stride: &usize| n_px / (stride * stride) <= MAX_POINTS).unwrap_or(1);
     let camera_from_depth = keyframe.world_from_camera.inverse() * depth.world_from_camera;
     let depth_at = |x: u32, y: u32| f64::from(depth.depth_m[(y * width + x) as usize]);
@@ -128,6 +133,8 @@ mod tests {
         let mut keyframe = wall([16, 12]);
         keyframe.depth = keyframe.depth.map(|depth| DepthMap { depth_m: vec![0.0; 192].into(), ..depth });
         assert!(pack_points(1, &keyframe).is_none());
+        keyframe.depth = wall([16, 12]).depth.map(|depth| DepthMap { depth_m: vec![1.0; 191].into(), ..depth });
+        assert!(pack_points(1, &keyframe).is_none(), "a value is missing");
         assert!(pack_points(1, &Keyframe { depth: None, ..keyframe }).is_none());
     }
 }

@@ -13,6 +13,9 @@ const BUFFER_BYTES: std::ops::RangeInclusive<f64> = 8192.0..=65_536.0;
 const INITIAL_BYTES_PER_SEC: f64 = 1.25e6;
 /// Shorter sends do not measure the link, but the memory of this computer.
 const MIN_SEND_SECS: f64 = 2e-4;
+/// Parts of less than half the usual size measure the link only if they take at least this long. Otherwise, the time
+/// is mostly that of the call.
+const MIN_SHORT_SEND_SECS: f64 = 5e-3;
 /// The estimate follows decreases quickly, but increases slowly.
 const MAX_INCREASE: f64 = 1.25;
 /// After a longer pause, the kernel's buffer may be empty. Data that fits into it then seems to be sent at once.
@@ -44,7 +47,10 @@ impl LinkRate {
         self.burst_secs += secs + pause.min(MAX_PAUSE).as_secs_f64();
         let measured = n_bytes as f64 / secs;
         if measured < self.bytes_per_sec {
-            self.bytes_per_sec = 0.5 * (self.bytes_per_sec + measured);
+            let is_short = 2 * n_bytes < self.part_bytes();
+            if !is_short || secs >= MIN_SHORT_SEND_SECS {
+                self.bytes_per_sec = 0.5 * (self.bytes_per_sec + measured);
+            }
             return;
         }
         // Without the data that is still in the buffer.
@@ -111,5 +117,19 @@ mod tests {
             rate.observe(rate.part_bytes(), Duration::from_micros(20), Duration::ZERO);
         }
         assert_eq!((rate.part_bytes(), rate.buffer_bytes()), (65_536, 65_536));
+        // The short ends of messages do not look like a slow link.
+        for _ in 0..40 {
+            rate.observe(300, Duration::from_micros(250), Duration::ZERO);
+        }
+        assert_eq!((rate.part_bytes(), rate.buffer_bytes()), (65_536, 65_536));
+    }
+
+    #[test]
+    fn short_messages_on_slow_links_are_measured() {
+        let mut rate = LinkRate::default();
+        for _ in 0..40 {
+            rate.observe(5000, Duration::from_millis(20), Duration::from_millis(50));
+        }
+        assert!(rate.buffer_bytes() <= 11_000, "{} bytes at 250 kB/s", rate.buffer_bytes());
     }
 }

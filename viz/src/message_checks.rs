@@ -53,7 +53,8 @@ fn check_subscription(subscriptions: &mut Subscriptions, message: SubscribeMessa
         return;
     }
     let images = subscriptions.images_of(&camera);
-    let periods = [subscriptions.status, subscriptions.keyframes, subscriptions.robot_state, images.period];
+    let Subscriptions { status, keyframes, robot_state, keyframe_points, .. } = *subscriptions;
+    let periods = [status, keyframes, robot_state, keyframe_points, images.period];
     assert!(periods.into_iter().flatten().all(|period| period.as_secs_f64() >= 0.999 / MAX_RATE_HZ));
     for size_px in [[640, 480], [1, 4000], [4096, 1]] {
         let fitted = fitted(size_px, images.max_px);

@@ -72,7 +72,8 @@ fn items(request: &HeaderMap, name: HeaderName) -> impl Iterator<Item = &str> {
     values.flat_map(|value| value.split(',')).map(str::trim)
 }
 
-fn has_version(request: &HeaderMap, etag: &str) -> bool {
+/// Whether the client already has the version of a file with this `ETag`.
+pub(crate) fn has_version(request: &HeaderMap, etag: &str) -> bool {
     let opaque = |tag: &str| tag.trim_start_matches("W/").to_owned();
     items(request, header::IF_NONE_MATCH).any(|item| item == "*" || opaque(item) == opaque(etag))
 }

@@ -3,7 +3,7 @@
 use crate::admission::{Admission, Connection, GuardedStream, Limits};
 use crate::broadcast::broadcast;
 use crate::clock::ServerClock;
-use crate::page::FILES;
+use crate::page::{FILES, has_version};
 use crate::protocol::MAX_MESSAGE_BYTES;
 use crate::server_context::ServerContext;
 use crate::session;
@@ -18,6 +18,7 @@ use hyper::server::conn::http1;
 use hyper::service::Service;
 use hyper_util::rt::{TokioIo, TokioTimer};
 use hyper_util::service::TowerToHyperService;
+use std::hash::{DefaultHasher, Hash, Hasher};
 use std::io::ErrorKind;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr, TcpListener};
 use std::sync::Arc;
@@ -254,16 +255,32 @@ async fn status(State(app_state): State<AppState>) -> Response {
     }
 }
 
-/// A mesh file of the robot. Names are numbers in a list, so that no other file can be requested.
-async fn robot_mesh(Path(name): Path<String>, State(app_state): State<AppState>) -> Response {
+/// A mesh file of the robot, or 304 if the client has this version. Names are numbers in a list, so that no other file
+/// can be requested.
+async fn robot_mesh(Path(name): Path<String>, State(app_state): State<AppState>, request: HeaderMap) -> Response {
     let robot = app_state.server_context.hub.robot().borrow().clone();
-    match robot.as_deref().and_then(|robot| robot.mesh_at(&name)) {
-        Some(mesh) => {
-            let headers = [(header::CONTENT_TYPE, mesh.format.content_type()), (header::CACHE_CONTROL, "no-store")];
-            (headers, Body::from(axum::body::Bytes::from_owner(Arc::clone(&mesh.bytes)))).into_response()
-        }
-        None => (StatusCode::NOT_FOUND, "the robot has no mesh with this name").into_response(),
+    let mesh = robot.as_deref().and_then(|robot| robot.mesh_at(&name));
+    let Some((format, bytes)) = mesh.map(|mesh| (mesh.format, Arc::clone(&mesh.bytes))) else {
+        return (StatusCode::NOT_FOUND, "the robot has no mesh with this name").into_response();
+    };
+    let hashed = Arc::clone(&bytes);
+    let etag = match tokio::task::spawn_blocking(move || etag(&hashed)).await {
+        Ok(etag) => etag,
+        Err(error) => return (StatusCode::INTERNAL_SERVER_ERROR, error.to_string()).into_response(),
+    };
+    let shared = [(header::ETAG, etag.as_str()), (header::CACHE_CONTROL, "no-cache")];
+    if has_version(&request, &etag) {
+        return (StatusCode::NOT_MODIFIED, shared).into_response();
     }
+    let content_type = [(header::CONTENT_TYPE, format.content_type())];
+    (shared, content_type, Body::from(axum::body::Bytes::from_owner(bytes))).into_response()
+}
+
+/// A checksum that only this program needs to reproduce.
+fn etag(bytes: &[u8]) -> String {
+    let mut hasher = DefaultHasher::new();
+    bytes.hash(&mut hasher);
+    format!("\"{:016x}\"", hasher.finish())
 }
 
 async fn connect(

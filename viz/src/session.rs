@@ -28,7 +28,7 @@ pub(crate) async fn serve(socket: WebSocket, connection: Arc<Connection>, server
     log::info!("client {client} connected");
     let (sink, stream) = socket.split();
     let (replies, waiting_replies) = mpsc::channel(MAX_REPLIES);
-    let (demand_sender, demand) = watch::channel(Demand::default());
+    let (demand_sender, demand) = watch::channel(Demand::new(Instant::now()));
     let reader =
         Reader { stream, hub: &server_context.hub, client, connection: &connection, replies, demand: demand_sender };
     let link = LinkRate::default();
@@ -109,7 +109,10 @@ impl Reader<'_> {
             ClientMessage::Hello(hello) => Some(match negotiate(&hello) {
                 Ok(agreement) => {
                     let has_keyframe_changes = agreement.negotiated.has_keyframe_changes;
-                    self.change_demand(|demand| demand.has_keyframe_changes = has_keyframe_changes);
+                    self.change_demand(|demand| {
+                        demand.has_hello = true;
+                        demand.has_keyframe_changes = has_keyframe_changes;
+                    });
                     Reply::Welcome(agreement)
                 }
                 Err(reason) => Reply::Goodbye { reason },

@@ -12,8 +12,11 @@ const MAX_CAMERAS: usize = 64;
 const MAX_NAME_BYTES: usize = 256;
 /// Maximum size of live images unless a client subscribes to another one: 640 pixels wide, any height.
 const DEFAULT_IMAGE_PX: [u32; 2] = [640, u32::MAX];
-/// Minimum size of live images, pixels.
+/// Minimum size of live images, pixels. Larger sizes are rounded down to multiples of it, so that clients of similar
+/// sizes share images.
 const MIN_IMAGE_PX: u32 = 16;
+/// Longest period. Slower subscriptions get one message a day.
+const MAX_PERIOD: Duration = Duration::from_secs(86_400);
 
 /// The subscriptions of one client.
 #[derive(Clone, Debug, PartialEq)]
@@ -24,10 +27,12 @@ pub(crate) struct Subscriptions {
     pub(crate) keyframes: Option<Duration>,
     /// Number of subscriptions to keyframes so far. Each of them begins with the complete list.
     pub(crate) n_keyframe_lists: u64,
-    /// The same for the joint positions.
+    /// Minimum time between two robot states; `None` if not sent.
     pub(crate) robot_state: Option<Duration>,
-    /// The same for the points of keyframes.
+    /// The same for the points of two keyframes.
     pub(crate) keyframe_points: Option<Duration>,
+    /// Number of subscriptions to points so far. Each of them begins with the points of all keyframes.
+    pub(crate) n_point_subscriptions: u64,
     /// Images of cameras without a subscription of their own.
     live_images: ImageSubscription,
     /// Images of single cameras.
@@ -51,6 +56,7 @@ impl Default for Subscriptions {
             n_keyframe_lists: 0,
             robot_state: None,
             keyframe_points: None,
+            n_point_subscriptions: 0,
             live_images: ImageSubscription { period: Some(Duration::from_millis(190)), max_px: DEFAULT_IMAGE_PX },
             cameras: BTreeMap::new(),
         }
@@ -70,7 +76,8 @@ impl Subscriptions {
         if let Some(got) = size_px.filter(|size_px| size_px.iter().any(|side| *side < MIN_IMAGE_PX)) {
             return Err(InvalidRequest::ImageSize { got, min: MIN_IMAGE_PX });
         }
-        let period = (rate_hz > 0.0).then(|| Duration::try_from_secs_f64(1.0 / rate_hz).unwrap_or(Duration::MAX));
+        let period = Duration::try_from_secs_f64(1.0 / rate_hz).unwrap_or(MAX_PERIOD).min(MAX_PERIOD);
+        let period = (rate_hz > 0.0).then_some(period);
         match topic {
             Topic::Status => self.status = period,
             Topic::Keyframes => {
@@ -78,9 +85,13 @@ impl Subscriptions {
                 self.n_keyframe_lists += 1;
             }
             Topic::RobotState => self.robot_state = period,
-            Topic::KeyframePoints => self.keyframe_points = period,
+            Topic::KeyframePoints => {
+                self.keyframe_points = period;
+                self.n_point_subscriptions += 1;
+            }
             Topic::LiveImages => {
-                let images = ImageSubscription { period, max_px: size_px.unwrap_or(DEFAULT_IMAGE_PX) };
+                let rounded = |size_px: [u32; 2]| size_px.map(|side| side / MIN_IMAGE_PX * MIN_IMAGE_PX);
+                let images = ImageSubscription { period, max_px: size_px.map_or(DEFAULT_IMAGE_PX, rounded) };
                 match camera {
                     None => self.live_images = images,
                     Some(camera) => self.set_camera(camera, images)?,
@@ -93,6 +104,11 @@ impl Subscriptions {
     /// The subscription to the images of a camera.
     pub(crate) fn images_of(&self, camera: &str) -> ImageSubscription {
         self.cameras.get(camera).copied().unwrap_or(self.live_images)
+    }
+
+    /// Whether the images of any camera are sent.
+    pub(crate) fn has_live_images(&self) -> bool {
+        std::iter::once(&self.live_images).chain(self.cameras.values()).any(|images| images.period.is_some())
     }
 
     fn set_camera(&mut self, camera: String, images: ImageSubscription) -> Result<(), InvalidRequest> {
@@ -130,18 +146,23 @@ mod tests {
     fn cameras_have_their_own_size_and_rate() {
         let mut subscriptions = Subscriptions::default();
         assert_eq!(subscriptions.images_of("wrist").max_px[0], 640);
-        apply(&mut subscriptions, json!({"topic": "live_images", "rate_hz": 2.0, "size_px": [240, 240]}))
+        apply(&mut subscriptions, json!({"topic": "live_images", "rate_hz": 2.0, "size_px": [240, 255]}))
             .expect("valid");
         apply(&mut subscriptions, json!({"topic": "live_images", "rate_hz": 0, "camera": "rear"})).expect("valid");
         assert_eq!(subscriptions.images_of("wrist").max_px, [240, 240]);
         assert_eq!(subscriptions.images_of("wrist").period, Some(Duration::from_millis(500)));
         assert_eq!(subscriptions.images_of("rear").period, None);
+        assert!(subscriptions.has_live_images());
+        apply(&mut subscriptions, json!({"topic": "live_images", "rate_hz": 0})).expect("valid");
+        assert!(!subscriptions.has_live_images(), "neither the rear camera nor the others");
+        apply(&mut subscriptions, json!({"topic": "live_images", "rate_hz": 1, "camera": "front"})).expect("valid");
+        assert!(subscriptions.has_live_images(), "the front camera");
         assert_eq!(subscriptions.robot_state, None, "costs nothing until a client subscribes");
         apply(&mut subscriptions, json!({"topic": "robot_state", "rate_hz": 50})).expect("valid");
         assert_eq!(subscriptions.robot_state, Some(Duration::from_millis(20)));
         // The slowest rate that a number can express is no error.
         apply(&mut subscriptions, json!({"topic": "status", "rate_hz": 5e-324})).expect("valid");
-        assert_eq!(subscriptions.status, Some(Duration::MAX));
+        assert_eq!(subscriptions.status, Some(Duration::from_secs(86_400)));
     }
 
     #[test]

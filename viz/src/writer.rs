@@ -82,7 +82,7 @@ type EncodingResult = Result<Result<Vec<u8>, PackError>, JoinError>;
 impl Writer<'_> {
     /// Sends until the connection fails or a goodbye is sent.
     ///
-    /// Order: replies, robot states, heartbeats, short updates, pictures, live images, keyframe lists.
+    /// Order: replies, robot states, heartbeats, short updates, pictures, live images and keyframes in turn.
     pub(crate) async fn run(
         mut self,
         wake: &Notify,
@@ -125,31 +125,37 @@ impl Writer<'_> {
                     }
                 }
             }
-            let subscriptions = Arc::clone(&demand.borrow_and_update().subscriptions);
-            let mut update_due = None;
-            let allows_long =
-                is_heard && transfer.is_none() && (encoding.is_none() || long_update_sent.elapsed() > MAX_UPDATE_DELAY);
+            let (subscriptions, settles_at) = {
+                let demand = demand.borrow_and_update();
+                (Arc::clone(&demand.subscriptions), demand.settles_at(Instant::now()))
+            };
+            let mut update_due = settles_at;
+            let allows_long = is_heard
+                && settles_at.is_none()
+                && transfer.is_none()
+                && (encoding.is_none() || long_update_sent.elapsed() > MAX_UPDATE_DELAY);
             if waiting_update.is_none() {
                 let latest = latest_messages.borrow_and_update();
                 let has_changes = self.negotiated.has_keyframe_changes;
                 match updates.next(&latest, &subscriptions, has_changes, Instant::now(), allows_long) {
                     Next::Short(message) => waiting_update = Some((message, false)),
                     Next::Long(message) => waiting_update = Some((message, true)),
-                    Next::WaitUntil(time) => update_due = Some(time),
+                    Next::WaitUntil(time) => update_due = Some(update_due.map_or(time, |due| due.min(time))),
                     Next::Wait => {}
                 }
             }
+            let is_waiting_long = waiting_update.as_ref().map(|(_, is_long)| *is_long);
+            // A waiting short message may be the robot, which comes before its states.
             let state_due = subscriptions
                 .robot_state
-                .filter(|_| is_heard)
+                .filter(|_| is_heard && updates.has_robot() && is_waiting_long != Some(false))
                 .map(|period| robot_state_sent.and_then(|sent| sent.checked_add(period)).unwrap_or_else(Instant::now));
-            let is_waiting_long = waiting_update.as_ref().map(|(_, is_long)| *is_long);
             tokio::select! {
                 biased;
                 _ = stopped.changed() => return self.send_goodbye_when_stopped().await,
                 Some(reply) = replies.recv() => self.reply(reply).await?,
                 () = changed_after(&mut robot_state, state_due) => {
-                    robot_state_sent = Some(Instant::now());
+                    robot_state_sent = state_due.zip(subscriptions.robot_state).map(on_schedule);
                     let state = robot_state.borrow_and_update().clone();
                     if let Some(state) = state {
                         let message = RobotStateMessage::new(&state, self.server_context.clock);
@@ -311,6 +317,13 @@ async fn finished(encoding: &mut Option<EncodingTask>) -> EncodingResult {
         Some(encoding) => (&mut encoding.task).await,
         None => std::future::pending().await,
     }
+}
+
+/// The time at which something counts as sent: when it was due, so that inaccurate timers do not lower its rate, or now
+/// if that is more than a period ago.
+fn on_schedule((due, period): (Instant, Duration)) -> Instant {
+    let now = Instant::now();
+    if now.saturating_duration_since(due) < period { due } else { now }
 }
 
 /// Waits until this time; forever without one.

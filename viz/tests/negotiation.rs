@@ -176,7 +176,7 @@ fn live_images_have_the_subscribed_size() {
     let (hub, server) = start();
     let mut thumbnails = Client::connect(server.address());
     let mut large = Client::connect(server.address());
-    thumbnails.send_json(&json!({"type": "subscribe", "topic": "live_images", "rate_hz": 9, "size_px": [640, 120]}));
+    thumbnails.send_json(&json!({"type": "subscribe", "topic": "live_images", "rate_hz": 9, "size_px": [160, 128]}));
     thumbnails.settle();
     large.settle();
     for (client, expected) in [(&mut thumbnails, json!([160, 120])), (&mut large, json!([640, 480]))] {
@@ -217,7 +217,7 @@ fn idle_page_receives_less_than_80_kb_per_second() {
     for (topic, rate_hz) in [("status", 2), ("keyframes", 2), ("robot_state", 60)] {
         client.send_json(&json!({"type": "subscribe", "topic": topic, "rate_hz": rate_hz}));
     }
-    client.send_json(&json!({"type": "subscribe", "topic": "live_images", "rate_hz": 4, "size_px": [640, 190]}));
+    client.send_json(&json!({"type": "subscribe", "topic": "live_images", "rate_hz": 4, "size_px": [640, 192]}));
     let images: Vec<_> = (1..9).map(camera_image).collect();
     let publish = |began: Instant, until: Duration| {
         for ix in 0.. {
@@ -415,6 +415,41 @@ fn decode_compact(header: &Value, bytes: &[u8]) -> Vec<f64> {
 }
 
 #[test]
+fn nothing_long_is_sent_before_a_hello_on_a_slow_link() {
+    const DELAY: Duration = Duration::from_millis(150);
+    let (hub, server) = start();
+    hub.set_keyframes((0..40).map(keyframe).collect());
+    hub.set_live_image(camera_image(1));
+    // Repeated if this computer is so busy that the hello came late.
+    for _ in 0..20 {
+        let began = Instant::now();
+        let mut client = Client::connect(server.address());
+        std::thread::sleep(DELAY);
+        client.send_json(&json!({"type": "subscribe", "topic": "live_images", "rate_hz": 4, "size_px": [160, 160]}));
+        client.send_json(&json!({"type": "hello", "protocols": [3, 4], "capabilities": ["keyframe_changes", "parts"]}));
+        if began.elapsed() > 2 * DELAY {
+            continue;
+        }
+        let mut kinds = Vec::new();
+        while !kinds.iter().any(|kind| kind == "keyframe_changes") || !kinds.iter().any(|kind| kind == "live_image") {
+            match client.receive() {
+                Received::Text(message) => kinds.push(message["type"].as_str().unwrap_or_default().to_owned()),
+                Received::Binary(header, _) => {
+                    assert_eq!(header["size_px"], json!([160, 120]), "the subscribed size");
+                    kinds.push("live_image".to_owned());
+                }
+                Received::End => panic!("disconnected after {kinds:?}"),
+            }
+        }
+        assert!(kinds.iter().all(|kind| kind != "keyframes"), "the list of version 3: {kinds:?}");
+        let position = |name: &str| kinds.iter().position(|kind| kind == name);
+        assert!(position("welcome") < position("keyframe_changes").min(position("live_image")), "{kinds:?}");
+        return;
+    }
+    panic!("no hello was sent in time");
+}
+
+#[test]
 fn robot_is_described_and_moves() {
     let (hub, server) = start();
     let mut client = Client::connect(server.address());
@@ -422,15 +457,11 @@ fn robot_is_described_and_moves() {
     hub.set_robot_state(robot::state(0.0));
     assert!(!hub.needs_robot_state(), "no client has subscribed");
     client.send_json(&json!({"type": "subscribe", "topic": "robot_state", "rate_hz": 60}));
-    // The description and the first state come in any order.
-    let (mut description, mut state) = (Value::Null, Value::Null);
-    while description.is_null() || state.is_null() {
-        match client.text() {
-            message if message["type"] == "robot" => description = message,
-            message if message["type"] == "robot_state" => state = message,
-            _ => {}
-        }
-    }
+    // The description comes before the first state.
+    let mut of_robot = std::iter::repeat_with(|| client.text())
+        .filter(|message| message["type"].as_str().is_some_and(|kind| kind.starts_with("robot")));
+    let (description, state) = (of_robot.next().expect("endless"), of_robot.next().expect("endless"));
+    assert_eq!((&description["type"], &state["type"]), (&json!("robot"), &json!("robot_state")));
     assert!(hub.needs_robot_state());
     assert_eq!(description["links"][1]["shapes"][0]["size_m"], json!([0.3, 0.2, 0.3]));
     assert_eq!(description["joints"][1]["axis"], json!([0.0, 0.0, 1.0]));
@@ -453,20 +484,27 @@ fn robot_is_described_and_moves() {
         }
     }
     assert!(f64::from(n_received) <= 60.0 * elapsed.as_secs_f64() + 3.0, "{n_received} states in {elapsed:?}");
-    let mesh = http_get(server.address(), "/robot/0.stl");
+    let mesh = http_get(server.address(), "/robot/0.stl", "");
     assert!(mesh.starts_with("HTTP/1.1 200") && mesh.ends_with("solid a"), "{mesh}");
     for path in
         ["/robot/1.stl", "/robot/0.dae", "/robot/..%2f..%2fetc%2fpasswd", "/robot/../status.stl", "/robot/a.stl"]
     {
-        assert!(http_get(server.address(), path).starts_with("HTTP/1.1 404"), "{path}");
+        assert!(http_get(server.address(), path, "").starts_with("HTTP/1.1 404"), "{path}");
     }
+    // Reloading the page does not transfer the meshes again.
+    let etag = mesh.lines().find_map(|line| line.strip_prefix("etag: ")).expect("an ETag");
+    let again = http_get(server.address(), "/robot/0.stl", &format!("If-None-Match: {etag}\r\n"));
+    assert!(again.starts_with("HTTP/1.1 304") && !again.contains("solid"), "{again}");
+    let other = http_get(server.address(), "/robot/0.stl", "If-None-Match: \"0\"\r\n");
+    assert!(other.starts_with("HTTP/1.1 200"), "{other}");
 }
 
-fn http_get(address: SocketAddr, path: &str) -> String {
+/// The response to a request with additional headers.
+fn http_get(address: SocketAddr, path: &str, headers: &str) -> String {
     use std::io::{Read, Write};
     let mut stream = TcpStream::connect(address).expect("the server listens");
     stream.set_read_timeout(Some(TIMEOUT)).expect("a timeout");
-    write!(stream, "GET {path} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n").expect("sent");
+    write!(stream, "GET {path} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n{headers}\r\n").expect("sent");
     let mut answer = Vec::new();
     stream.read_to_end(&mut answer).expect("an answer");
     String::from_utf8_lossy(&answer).into_owned()
