@@ -12,13 +12,15 @@ pub struct RobotMotion {
     joint_offsets: Vec<f64>,
     /// `None` before the first pose of a moving base.
     world_from_base: Option<Transform>,
+    /// Time of this pose; `None` if the base is fixed.
+    base_stamp: Option<Stamp>,
     has_moving_base: bool,
 }
 
 /// Joint positions and base pose at one time.
 #[derive(Clone, Debug, PartialEq)]
 pub struct RobotReading {
-    /// Time of the reading.
+    /// Time of the reading: the older one of joint positions and base pose, so that neither is older than its stamp.
     pub stamp: Stamp,
     /// Pose of the base, without the correction of its station.
     pub world_from_base: Transform,
@@ -35,6 +37,7 @@ impl RobotMotion {
             n_joints: rig.arm.joints.len(),
             joint_offsets: rig.arm.joint_offsets.clone(),
             world_from_base: (!has_moving_base).then_some(rig.base.world_from_base),
+            base_stamp: None,
             has_moving_base,
         }
     }
@@ -47,10 +50,11 @@ impl RobotMotion {
                 let offset = |ix: usize| self.joint_offsets.get(ix).copied().unwrap_or_default();
                 let positions = state.position.iter().enumerate().map(|(ix, position)| position + offset(ix)).collect();
                 let world_from_base = self.world_from_base.filter(|_| is_valid)?;
-                Some(RobotReading { stamp: state.stamp, world_from_base, positions })
+                let stamp = self.base_stamp.map_or(state.stamp, |base_stamp| base_stamp.min(state.stamp));
+                Some(RobotReading { stamp, world_from_base, positions })
             }
             Sample::Base(pose) if self.has_moving_base && kinematics::transform::is_finite(&pose.world_from_base) => {
-                self.world_from_base = Some(pose.world_from_base);
+                (self.world_from_base, self.base_stamp) = (Some(pose.world_from_base), Some(pose.stamp));
                 // Readings of the joints come more often than base poses.
                 (self.n_joints == 0).then(|| RobotReading {
                     stamp: pose.stamp,
@@ -70,7 +74,11 @@ mod tests {
     use kinematics::{JointState, Stamp, Transform};
 
     fn joints(position: Vec<f64>) -> Sample {
-        Sample::Joints(JointState { stamp: Stamp(7), position, velocity: Vec::new(), effort: Vec::new() })
+        joints_at(7, position)
+    }
+
+    fn joints_at(stamp: i64, position: Vec<f64>) -> Sample {
+        Sample::Joints(JointState { stamp: Stamp(stamp), position, velocity: Vec::new(), effort: Vec::new() })
     }
 
     fn base(x: f64) -> Sample {
@@ -82,6 +90,7 @@ mod tests {
             n_joints,
             joint_offsets: vec![0.1; n_joints],
             world_from_base,
+            base_stamp: None,
             has_moving_base: world_from_base.is_none(),
         }
     }
@@ -97,6 +106,17 @@ mod tests {
         let mut fixed = motion(2, Some(Transform::identity()));
         assert_eq!(fixed.push(&base(3.0)), None, "a fixed base does not move");
         assert_eq!(fixed.push(&joints(vec![0.0, 0.0])).expect("a reading").world_from_base, Transform::identity());
+    }
+
+    #[test]
+    fn the_older_of_joints_and_base_counts() {
+        let mut moving = motion(1, None);
+        assert_eq!(moving.push(&base(0.0)), None, "the joints follow");
+        assert_eq!(moving.push(&joints_at(8, vec![0.0])).expect("a reading").stamp, Stamp(8), "the base is newer");
+        let frozen = moving.push(&joints_at(5_000, vec![0.0])).expect("a reading");
+        assert_eq!(frozen.stamp, Stamp(9), "the base has not reported since");
+        let mut fixed = motion(1, Some(Transform::identity()));
+        assert_eq!(fixed.push(&joints_at(5_000, vec![0.0])).expect("a reading").stamp, Stamp(5_000));
     }
 
     #[test]

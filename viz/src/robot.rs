@@ -72,7 +72,7 @@ impl MeshFormat {
 /// Positions of the robot's joints and pose of its base at one time.
 #[derive(Clone, Debug, PartialEq)]
 pub struct RobotState {
-    /// Time of the joint readings.
+    /// Time of the joint positions or of the base pose, whichever is older.
     pub stamp: Stamp,
     /// The same time on this process's clock, from which the age of the state is computed.
     ///
