@@ -8,7 +8,7 @@ pub struct Viewers(pub Hub);
 
 impl InputObserver for Viewers {
     fn needs_images(&self) -> bool {
-        self.0.n_clients() > 0
+        self.0.needs_live_images()
     }
 
     fn observe(&self, image: ObservedImage) {
