@@ -96,7 +96,7 @@ fn faulty(fault: Fault) -> (ArmCapture, Vec<f64>, Arc<Mutex<Log>>) {
     (capture, start, log)
 }
 
-fn turned(start: &[f64], angle: f64) -> Vec<f64> {
+fn rotated(start: &[f64], angle: f64) -> Vec<f64> {
     let mut joints = start.to_vec();
     joints[JOINT] += angle;
     joints
@@ -105,7 +105,7 @@ fn turned(start: &[f64], angle: f64) -> Vec<f64> {
 #[test]
 fn blocked_arm_returns_to_the_previous_step() {
     let (mut capture, start, log) = faulty(Fault::BlockedAt(0.25));
-    let error = capture.move_to(&turned(&start, 0.6), &Stop::default()).expect_err("the joint is blocked").to_string();
+    let error = capture.move_to(&rotated(&start, 0.6), &Stop::default()).expect_err("the joint is blocked").to_string();
     assert!(error.contains("check for an obstacle") && error.contains("has returned to the previous step"), "{error}");
     let log = log.lock();
     // Two steps were commanded; the second was blocked.
@@ -117,7 +117,7 @@ fn blocked_arm_returns_to_the_previous_step() {
 #[test]
 fn stuck_arm_is_commanded_to_where_it_is() {
     let (mut capture, start, log) = faulty(Fault::StuckAt(0.11));
-    let error = capture.move_to(&turned(&start, 0.24), &Stop::default()).expect_err("the joint is stuck").to_string();
+    let error = capture.move_to(&rotated(&start, 0.24), &Stop::default()).expect_err("the joint is stuck").to_string();
     assert!(error.contains("check for an obstacle") && error.contains("holds where it is"), "{error}");
     let last = *log.lock().targets.last().expect("a target");
     assert!((last - start[JOINT] - 0.11).abs() < 0.01, "{last} from {}", start[JOINT]);
@@ -145,7 +145,7 @@ fn sag_is_corrected_in_the_next_step() {
 fn arm_that_leaves_its_limit_is_returned() {
     let (mut capture, start, log) = faulty(Fault::Sags(0.0));
     capture.limit_distance(0.02).expect("a state");
-    let error = capture.move_to(&turned(&start, 0.6), &Stop::default()).expect_err("it is too far").to_string();
+    let error = capture.move_to(&rotated(&start, 0.6), &Stop::default()).expect_err("it is too far").to_string();
     assert!(error.contains("mm from its start (at most 20 mm)"), "{error}");
     assert!(error.contains("has returned to the previous step"), "{error}");
     assert_eq!(log.lock().targets.len(), 2, "one step and back");
@@ -154,7 +154,7 @@ fn arm_that_leaves_its_limit_is_returned() {
 #[test]
 fn arm_that_reports_nothing_is_stopped() {
     let (mut capture, start, log) = faulty(Fault::Silent);
-    let error = capture.move_to(&turned(&start, 0.2), &Stop::default()).expect_err("it is silent");
+    let error = capture.move_to(&rotated(&start, 0.2), &Stop::default()).expect_err("it is silent");
     assert!(format!("{error:#}").contains("no joint"), "{error:#}");
     assert_eq!(log.lock().n_stops, 1);
 }

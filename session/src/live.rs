@@ -350,15 +350,15 @@ impl Live {
             let before = Instant::now();
             // The GPU draws the next pictures while the first ones are delivered.
             let mut queued = Vec::new();
+            let mut is_any_on_gpu = false;
             while let Some(picture) = self.queue_picture() {
                 let is_on_gpu = picture.queued.as_ref().is_ok_and(|queued| !queued.is_ready());
+                is_any_on_gpu |= is_on_gpu;
                 queued.push(picture);
                 if !is_on_gpu || queued.len() == MAX_QUEUED_PICTURES {
                     break;
                 }
             }
-            let is_any_on_gpu =
-                queued.iter().any(|render| render.queued.as_ref().is_ok_and(|queued| !queued.is_ready()));
             let trained = if is_any_on_gpu { self.queue_steps() } else { Ok(()) };
             let mut began = before;
             for picture in queued {

@@ -7,7 +7,7 @@ mod browser;
 mod proxy;
 
 use analytic_scene::{draw, looking_along_y};
-use browser::{Browser, chromium};
+use browser::{Browser, canvas_shot, chromium, wait_for};
 use kinematics::{Stamp, Transform};
 use nalgebra::{Point3, Translation3, UnitQuaternion, Vector3};
 use proxy::Proxy;
@@ -30,8 +30,6 @@ const MAX_LOSS_DISPLAY_MILLIS: f64 = 1000.0;
 const DRAWING: Duration = Duration::from_millis(25);
 /// Duration of the interruption.
 const CUT: Duration = Duration::from_secs(25);
-/// Far more than two busy cores need to draw the page in software.
-const TIMEOUT: Duration = Duration::from_secs(60);
 /// Whether a pixel contains some of the page's `--accent`, the color of live cameras. Nothing else in this scene is
 /// blue-green.
 fn is_accent([red, green, blue]: [u8; 3]) -> bool {
@@ -442,23 +440,6 @@ impl Camera {
         self.stop.store(true, Ordering::Relaxed);
         self.thread.join().expect("no panic");
     }
-}
-
-fn wait_for(browser: &mut Browser, what: &str, mut is_there: impl FnMut(&mut Browser) -> bool) {
-    let started = Instant::now();
-    while !is_there(browser) {
-        assert!(started.elapsed() < TIMEOUT, "timed out waiting for {what}");
-        std::thread::sleep(Duration::from_millis(50));
-    }
-}
-
-/// The part of the window that the view covers.
-fn canvas_shot(browser: &mut Browser) -> image::RgbImage {
-    browser.next_frame();
-    let bounds = browser.evaluate("(() => { const b = document.getElementById('canvas').getBoundingClientRect(); return [b.x, b.y, b.width, b.height].map(Math.round) })()");
-    let bound = |ix: usize| bounds[ix].as_u64().and_then(|n| u32::try_from(n).ok()).expect("a bound");
-    let shot = image::load_from_memory_with_format(&browser.screenshot(), image::ImageFormat::Png).expect("a PNG");
-    shot.crop_imm(bound(0), bound(1), bound(2), bound(3)).to_rgb8()
 }
 
 #[expect(clippy::cast_possible_truncation, reason = "pixels of a window")]

@@ -8,21 +8,19 @@ mod browser;
 mod robot;
 
 use analytic_scene::{draw, looking_along_y, ray_in_world};
-use browser::{Browser, chromium};
+use browser::{Browser, canvas_bounds, canvas_shot, chromium, wait_for};
 use kinematics::Chain;
 use nalgebra::{Point3, Translation3, Vector3};
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 use trainer::{Projection, RenderRequest};
 use viz::{Hub, RobotState, SceneHint, Server, ServerConfig};
 
 const WINDOW_PX: [u32; 2] = [1280, 760];
 /// Required overlap of the drawn silhouette with the exact one: intersection over union.
 const MIN_IOU: f64 = 0.97;
-/// Far more than two busy cores need to draw the page in software.
-const TIMEOUT: Duration = Duration::from_secs(60);
 /// Part of the view that nothing else covers: distance from its top and bottom edges, pixels.
 const MARGIN_PX: u32 = 60;
 
@@ -75,7 +73,7 @@ impl Run {
         *self.base_x.lock().expect("no panic") = x;
     }
 
-    fn turn_to(&self, angle: f64) {
+    fn rotate_to(&self, angle: f64) {
         *self.angle.lock().expect("no panic") = angle;
     }
 
@@ -153,7 +151,7 @@ fn robot_silhouette_is_exact_in_front_and_behind() {
 
     let mut masks = Vec::new();
     for angle in [0.0, 0.9] {
-        run.turn_to(angle);
+        run.rotate_to(angle);
         std::thread::sleep(Duration::from_millis(500));
         for is_occluded in [true, false] {
             let shot = canvas_shot(&mut browser);
@@ -183,7 +181,7 @@ fn robot_silhouette_is_exact_in_front_and_behind() {
     std::fs::remove_dir_all(&profile).expect("the browser has left its profile");
 }
 
-/// A double click turns the view toward the surface at that pixel.
+/// A double click rotates the view toward the surface at that pixel.
 fn check_pivot(browser: &mut Browser, run: &Run) {
     let before = run.last_request();
     let [x, y] = [before.size_px[0] / 2 - 150, before.size_px[1] / 2 + 250];
@@ -192,7 +190,7 @@ fn check_pivot(browser: &mut Browser, run: &Run) {
     assert!(depth > 0.0, "there is a surface");
     let (eye, direction) = ray_in_world(&before, f64::from(x) + 0.5, f64::from(y) + 0.5);
     let surface = eye + direction * depth;
-    let [left, top] = canvas_origin(browser);
+    let [left, top, ..] = canvas_bounds(browser);
     browser.evaluate(&format!(
         "document.getElementById('canvas').dispatchEvent(new MouseEvent('dblclick', {{clientX: {}, clientY: {}}}))",
         left + x,
@@ -229,7 +227,7 @@ fn check_crop(browser: &mut Browser, run: &Run) {
     let Projection::Pinhole { focal_px, principal_px } = before.projection else { panic!("a pinhole") };
     let in_camera = before.world_from_camera.inverse_transform_point(&Point3::new(0.48, 0.0, 0.2));
     let at = |axis: usize| focal_px[axis] * in_camera[axis] / in_camera.z + principal_px[axis];
-    let [left, top] = canvas_origin(browser);
+    let [left, top, ..] = canvas_bounds(browser);
     #[expect(clippy::cast_possible_truncation, reason = "pixels of a window")]
     let handle = [at(0) as i32 + left.cast_signed(), at(1) as i32 + top.cast_signed()];
     browser.mouse("mousePressed", handle);
@@ -256,39 +254,15 @@ fn check_follow(browser: &mut Browser, run: &Run) {
         let chain = Chain::from_urdf(robot::URDF, "pedestal", "arm").expect("a chain");
         (robot::state(angle).world_from_base * chain.forward(&[angle]).expect("a pose")).translation.vector
     };
-    // The last joint turns the arm about its own axis, so that the origin of its link stays.
+    // The last joint rotates the arm about its own axis, so that the origin of its link stays.
     assert!((tip(0.9) - tip(0.2)).norm() < 1e-9);
     let before = run.last_request().world_from_camera.translation.vector;
     browser.click("toggle-follow");
-    run.turn_to(0.2);
+    run.rotate_to(0.2);
     std::thread::sleep(Duration::from_millis(300));
     run.move_base(0.25);
     wait_for(browser, "a view that has moved with the base", |_| {
         let moved = run.last_request().world_from_camera.translation.vector - before;
         (moved - Vector3::new(0.25, 0.0, 0.0)).norm() < 1e-3
     });
-}
-
-/// Position of the view in the window.
-fn canvas_origin(browser: &mut Browser) -> [u32; 2] {
-    let script = "(() => { const b = document.getElementById('canvas').getBoundingClientRect(); return [b.x, b.y].map(Math.round) })()";
-    let bounds = browser.evaluate(script);
-    [0, 1].map(|ix| bounds[ix].as_u64().and_then(|n| u32::try_from(n).ok()).expect("a position"))
-}
-
-fn wait_for(browser: &mut Browser, what: &str, mut is_there: impl FnMut(&mut Browser) -> bool) {
-    let started = Instant::now();
-    while !is_there(browser) {
-        assert!(started.elapsed() < TIMEOUT, "timed out waiting for {what}");
-        std::thread::sleep(Duration::from_millis(50));
-    }
-}
-
-/// The part of the window that the view covers.
-fn canvas_shot(browser: &mut Browser) -> image::RgbImage {
-    browser.next_frame();
-    let bounds = browser.evaluate("(() => { const b = document.getElementById('canvas').getBoundingClientRect(); return [b.x, b.y, b.width, b.height].map(Math.round) })()");
-    let bound = |ix: usize| bounds[ix].as_u64().and_then(|n| u32::try_from(n).ok()).expect("a bound");
-    let shot = image::load_from_memory_with_format(&browser.screenshot(), image::ImageFormat::Png).expect("a PNG");
-    shot.crop_imm(bound(0), bound(1), bound(2), bound(3)).to_rgb8()
 }

@@ -194,8 +194,8 @@ fn first_poses(
         let center = (base_from_camera * board.camera_from_board * Point3::from(*center_in_board)).coords;
         poses.extend(DIRECTIONS.map(|direction| {
             let axis = base_from_camera.rotation * unit(direction);
-            let turn = UnitQuaternion::from_scaled_axis(axis * ABOUT_TARGET_DEG.to_radians());
-            let about_center = Transform::from_parts((center - turn * center).into(), turn);
+            let rotation = UnitQuaternion::from_scaled_axis(axis * ABOUT_TARGET_DEG.to_radians());
+            let about_center = Transform::from_parts((center - rotation * center).into(), rotation);
             (about_center * start, name("orbit the target", direction, ABOUT_TARGET_DEG, "camera"))
         }));
     }

@@ -76,8 +76,8 @@ mod tests {
         assert!(joints.iter().zip(&START).all(|(a, b)| (a - b).abs() <= 0.6), "{joints:?}");
         let far = start * Transform::translation(0.2, 0.0, 0.0);
         assert_eq!(reach.joints_for(&far, &START), None, "beyond the distance");
-        let turned = start * Transform::new(Vector3::zeros(), Vector3::z() * 0.9);
-        assert_eq!(reach.joints_for(&turned, &START), None, "a joint would turn by more than 0.6");
+        let rotated = start * Transform::new(Vector3::zeros(), Vector3::z() * 0.9);
+        assert_eq!(reach.joints_for(&rotated, &START), None, "a joint would rotate by more than 0.6");
         // The first and the last configuration are near, but the flange passes far from the start.
         let mut current = START;
         current[3] += 1.2;
@@ -90,14 +90,14 @@ mod tests {
         let wide = Reach { chain: &chain, start: &START, max_joint_change: 1.5, max_distance_m: 0.5 };
         let start = chain.forward(&START).unwrap();
         // The flange is where it was, but on the way it moves.
-        let turned = start * Transform::new(Vector3::zeros(), Vector3::y() * 0.7);
-        let joints = wide.joints_for(&turned, &START).expect("the pose is near");
+        let rotated = start * Transform::new(Vector3::zeros(), Vector3::y() * 0.7);
+        let joints = wide.joints_for(&rotated, &START).expect("the pose is near");
         let middle: Vec<f64> = joints.iter().zip(&START).map(|(a, b)| 0.5 * (a + b)).collect();
         let middle = chain.forward(&middle).unwrap();
         let largest_m = (middle.translation.vector - start.translation.vector).norm();
         assert!(largest_m > 0.002, "{largest_m} m");
         let narrow = Reach { max_distance_m: 0.9 * largest_m, ..wide };
-        assert_eq!(narrow.joints_for(&turned, &joints), None, "the arm is there, but cannot return");
+        assert_eq!(narrow.joints_for(&rotated, &joints), None, "the arm is there, but cannot return");
     }
 
     #[test]

@@ -35,7 +35,7 @@ pub struct IntrinsicsGuidance {
 pub enum IntrinsicsAdvice {
     /// Show the whole target to the camera.
     ShowTarget,
-    /// Move the target to this part of the image, or turn the camera.
+    /// Move the target to this part of the image, or rotate the camera.
     MoveTo(ImageRegion),
     /// Tilt the target so that this side is farther from the camera.
     Tilt(Side),

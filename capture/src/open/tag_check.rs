@@ -3,10 +3,11 @@
 use crate::config::{BaseDriver, Camera, Rig};
 use crate::join::{CameraPose, Motion};
 use crate::notes::Notes;
+use crate::open::tags::rolling_shutter_camera;
 use calibration::{TagCheck, TagObservation};
-use drivers::tags::{RollingShutterCamera, TagDetections, TagDetector, TagPlacement, locate};
+use drivers::tags::{TagDetections, TagDetector, TagPlacement, locate};
 use drivers::{Error, Image, Sample, Source};
-use kinematics::{HistoryError, Stamp, Twist};
+use kinematics::{HistoryError, Stamp};
 use std::collections::{BTreeMap, VecDeque};
 
 /// Interval between the images of a camera in which tags are searched, seconds. Detection must not slow down a run.
@@ -103,11 +104,7 @@ impl CheckedCamera {
     ) {
         let known: Vec<(u32, &TagPlacement, [[f64; 2]; 4])> =
             detections.tags.iter().filter_map(|tag| Some((tag.id, placements.get(&tag.id)?, tag.corners_px))).collect();
-        let camera = RollingShutterCamera {
-            intrinsics: &self.config.intrinsics,
-            twist: pose.twist.unwrap_or_else(Twist::zero),
-            readout_secs: self.config.readout_micros.unwrap_or(0.0) * 1e-6,
-        };
+        let camera = rolling_shutter_camera(&self.config, pose);
         let corners: Vec<_> = known.iter().map(|(_, placement, corners_px)| (*placement, *corners_px)).collect();
         // Images in which the pose is ambiguous or no pose fits are not compared.
         let Ok(estimate) = locate(&camera, &corners) else { return };

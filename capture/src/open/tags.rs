@@ -129,11 +129,7 @@ impl TagBaseSource {
         let Some(detection) = self.pending.front() else { return };
         let Some(camera) = self.camera(&detection.camera) else { return };
         let known = detection.tags.iter().filter_map(|tag| Some((self.tags.get(&tag.id)?, tag.corners_px)));
-        let rolling_camera = RollingShutterCamera {
-            intrinsics: &camera.intrinsics,
-            twist: camera_pose.twist.unwrap_or_else(Twist::zero),
-            readout_secs: camera.readout_micros.unwrap_or(0.0) * 1e-6,
-        };
+        let rolling_camera = rolling_shutter_camera(camera, camera_pose);
         let estimate = locate(&rolling_camera, &known.collect::<Vec<_>>());
         match estimate {
             Ok(estimate) if self.newest.is_none_or(|newest| stamp > newest) => {
@@ -188,6 +184,15 @@ impl TagBaseSource {
             log::warn!("base: no pose for {:.0} s; camera {camera:?}: {why}{others}", stamp.secs_since(since));
             self.no_pose_since = Some(stamp);
         }
+    }
+}
+
+/// A camera during the readout of an image.
+pub(super) fn rolling_shutter_camera<'a>(camera: &'a Camera, pose: &CameraPose) -> RollingShutterCamera<'a> {
+    RollingShutterCamera {
+        intrinsics: &camera.intrinsics,
+        twist: pose.twist.unwrap_or_else(Twist::zero),
+        readout_secs: camera.readout_micros.unwrap_or(0.0) * 1e-6,
     }
 }
 

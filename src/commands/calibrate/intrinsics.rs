@@ -132,18 +132,8 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         rig.expect_size(*size_px)?;
     }
     let result = args.calibrate(&detected);
-    // The result is printed even if the report cannot be written.
-    let written = match report {
-        Some(path) => args.write_report(path, &detected, &result),
-        None => Ok(()),
-    };
-    let calibration = match result {
-        Ok(calibration) => calibration,
-        Err(error) => {
-            outputs::log_failure(written);
-            return Err(error);
-        }
-    };
+    let (calibration, written) =
+        outputs::reported(result, report, |path, result| args.write_report(path, &detected, result))?;
     let printed = printed(&calibration, &detected.unused);
     if args.json {
         print::json(&printed)?

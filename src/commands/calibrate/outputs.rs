@@ -216,6 +216,23 @@ pub(super) fn write_report(file: &Path, html: &str) -> anyhow::Result<()> {
     Ok(())
 }
 
+/// Writes the report, if one is requested, on a result or on the reason why there is none. Returns the result, and whether
+/// the report was written: the result is printed even if it was not.
+pub(super) fn reported<T>(
+    result: anyhow::Result<T>,
+    report: Option<&Path>,
+    write: impl FnOnce(&Path, &anyhow::Result<T>) -> anyhow::Result<()>,
+) -> anyhow::Result<(T, anyhow::Result<()>)> {
+    let written = report.map_or(Ok(()), |path| write(path, &result));
+    match result {
+        Ok(result) => Ok((result, written)),
+        Err(error) => {
+            log_failure(written);
+            Err(error)
+        }
+    }
+}
+
 /// Logs why a report was not written, if another error is returned.
 pub(super) fn log_failure(written: anyhow::Result<()>) {
     if let Err(error) = written {

@@ -118,18 +118,8 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     // Devices may report calibration that the rig file does not contain.
     let rig = if args.sim || data.rig.is_none() || !is_rig_file(&args.input) { given } else { data.rig.clone() };
     let result = calibrate_scene(&data, &args.params, rig.as_ref()).map_err(anyhow::Error::from);
-    // The result is printed even if the report cannot be written.
-    let written = match report {
-        Some(path) => args.write_report(path, &data, rig.as_ref(), &result),
-        None => Ok(()),
-    };
-    let calibration = match result {
-        Ok(calibration) => calibration,
-        Err(error) => {
-            outputs::log_failure(written);
-            return Err(error);
-        }
-    };
+    let (calibration, written) =
+        outputs::reported(result, report, |path, result| args.write_report(path, &data, rig.as_ref(), result))?;
     let exit = exit::from_losses(&data.data_losses);
     let printed = printed(&data, &calibration, refusal(&data, &calibration));
     let is_refused = printed.refused.is_some();

@@ -5,7 +5,7 @@ use std::io::{BufRead, BufReader};
 use std::net::TcpStream;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 use tungstenite::{Message, WebSocket};
 
 /// Far more than a browser needs on two busy cores.
@@ -153,4 +153,27 @@ fn bytes_from_base64(text: &str) -> Vec<u8> {
             bits.to_be_bytes()[1..group.len()].to_vec()
         })
         .collect()
+}
+
+/// Waits until the page is in a state.
+pub(crate) fn wait_for(browser: &mut Browser, what: &str, mut is_there: impl FnMut(&mut Browser) -> bool) {
+    let started = Instant::now();
+    while !is_there(browser) {
+        assert!(started.elapsed() < TIMEOUT, "timed out waiting for {what}");
+        std::thread::sleep(Duration::from_millis(50));
+    }
+}
+
+/// Left, top, width and height of the view in the window, pixels.
+pub(crate) fn canvas_bounds(browser: &mut Browser) -> [u32; 4] {
+    let bounds = browser.evaluate("(() => { const b = document.getElementById('canvas').getBoundingClientRect(); return [b.x, b.y, b.width, b.height].map(Math.round) })()");
+    [0, 1, 2, 3].map(|ix| bounds[ix].as_u64().and_then(|n| u32::try_from(n).ok()).expect("a bound"))
+}
+
+/// The part of the window that the view covers.
+pub(crate) fn canvas_shot(browser: &mut Browser) -> image::RgbImage {
+    browser.next_frame();
+    let [x, y, width, height] = canvas_bounds(browser);
+    let shot = image::load_from_memory_with_format(&browser.screenshot(), image::ImageFormat::Png).expect("a PNG");
+    shot.crop_imm(x, y, width, height).to_rgb8()
 }

@@ -7,7 +7,7 @@ use nalgebra::{Point3, Vector3};
 use std::time::Instant;
 use viz::{MeshFormat, RobotDescription, RobotMesh, RobotState};
 
-/// A pedestal, an arm that turns about z, and a ball that slides along the arm; a mesh that only some tests load.
+/// A pedestal, an arm that rotates about z, and a ball that slides along the arm; a mesh that only some tests load.
 pub(crate) const URDF: &str = r#"<robot name="crane">
     <material name="yellow"><color rgba="0.9 0.8 0.1 1"/></material>
     <link name="world_link"/>
@@ -22,7 +22,7 @@ pub(crate) const URDF: &str = r#"<robot name="crane">
       <visual><geometry><sphere radius="0.1"/></geometry><material name="yellow"/></visual>
     </link>
     <joint name="mount" type="fixed"><parent link="world_link"/><child link="pedestal"/><origin xyz="0 0 0"/></joint>
-    <joint name="turn" type="revolute"><parent link="pedestal"/><child link="arm"/><origin xyz="0 0 0.4"/>
+    <joint name="rotate" type="revolute"><parent link="pedestal"/><child link="arm"/><origin xyz="0 0 0.4"/>
       <axis xyz="0 0 1"/><limit lower="-3" upper="3" velocity="1" effort="1"/></joint>
     <joint name="slide" type="prismatic"><parent link="arm"/><child link="tip"/><origin xyz="0.3 0 0"/>
       <axis xyz="1 0 0"/><limit lower="0" upper="0.3" velocity="1" effort="1"/></joint>
@@ -33,18 +33,18 @@ pub(crate) fn description() -> RobotDescription {
     RobotDescription {
         robot: Robot::parse(URDF).expect("a robot"),
         base_link: "pedestal".to_owned(),
-        joint_names: vec!["slide".to_owned(), "turn".to_owned()],
+        joint_names: vec!["slide".to_owned(), "rotate".to_owned()],
         meshes: vec![RobotMesh { file: "a.stl".to_owned(), format: MeshFormat::Stl, bytes: (*b"solid a").into() }],
     }
 }
 
-/// The robot beside the scene's center, with its arm turned by `turn` radians.
-pub(crate) fn state(turn: f64) -> RobotState {
+/// The robot beside the scene's center, with its arm rotated by `rotation_rad`.
+pub(crate) fn state(rotation_rad: f64) -> RobotState {
     RobotState {
         stamp: Stamp(1_000_000),
         captured_at: Instant::now(),
         world_from_base: Transform::translation(-0.4, 0.3, 0.0) * Transform::rotation(Vector3::new(0.0, 0.0, 0.2)),
-        positions: vec![0.2, turn],
+        positions: vec![0.2, rotation_rad],
     }
 }
 
@@ -54,12 +54,12 @@ pub(crate) struct PosedShapes(Vec<(Transform, Geometry)>);
 impl PosedShapes {
     pub(crate) fn new(state: &RobotState) -> Self {
         let robot = Robot::parse(URDF).expect("a robot");
-        let [slide, turn] = state.positions[..] else { panic!("two joints") };
+        let [slide, rotate] = state.positions[..] else { panic!("two joints") };
         let mut shapes = Vec::new();
         for link in robot.links().iter().filter(|link| *link != "world_link") {
             let chain = Chain::new(&robot, "pedestal", link).expect("a chain");
             let positions: Vec<f64> =
-                chain.joint_names().iter().map(|name| if name == "slide" { slide } else { turn }).collect();
+                chain.joint_names().iter().map(|name| if name == "slide" { slide } else { rotate }).collect();
             let world_from_link = state.world_from_base * chain.forward(&positions).expect("a pose");
             for shape in robot.visuals(link) {
                 shapes.push(((world_from_link * shape.link_from_shape).inverse(), shape.geometry.clone()));

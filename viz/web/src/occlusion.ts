@@ -29,8 +29,8 @@ const FRAGMENT = /* glsl */ `
   uniform bool occlusionIsOn;
   uniform vec2 occlusionTolerance;
   float depthAt(vec2 uv) { return texture2D(occlusionDepth, uv).r; }
-  // The smaller of two differences: the slope of the surface, but not the step at its edge.
-  float slope(float depth, float before, float after) {
+  // The smaller of two differences: the change of depth along the surface, but not the step at its edge.
+  float depthChange(float depth, float before, float after) {
     float a = before > 0.0 ? abs(before - depth) : 1e9;
     float b = after > 0.0 ? abs(after - depth) : 1e9;
     float smaller = min(a, b);
@@ -45,9 +45,9 @@ const FRAGMENT = /* glsl */ `
     float depth = depthAt(uv);
     if (!(depth > 0.0)) return false;
     vec2 texel = 1.0 / vec2(textureSize(occlusionDepth, 0));
-    float slopes = slope(depth, depthAt(uv - vec2(texel.x, 0.0)), depthAt(uv + vec2(texel.x, 0.0)))
-      + slope(depth, depthAt(uv - vec2(0.0, texel.y)), depthAt(uv + vec2(0.0, texel.y)));
-    return p.z > depth * (1.0 + occlusionTolerance.x) + occlusionTolerance.y + slopes;
+    float change = depthChange(depth, depthAt(uv - vec2(texel.x, 0.0)), depthAt(uv + vec2(texel.x, 0.0)))
+      + depthChange(depth, depthAt(uv - vec2(0.0, texel.y)), depthAt(uv + vec2(0.0, texel.y)));
+    return p.z > depth * (1.0 + occlusionTolerance.x) + occlusionTolerance.y + change;
   }`;
 
 /** The picture that hides what lies behind it. */
