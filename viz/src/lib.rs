@@ -13,6 +13,7 @@
 //! ```
 
 mod admission;
+mod base_path;
 mod broadcast;
 mod client_updates;
 mod clock;
@@ -31,6 +32,7 @@ mod picture;
 mod pose;
 mod protocol;
 mod queue;
+mod range_scan;
 mod robot;
 mod server;
 mod server_context;
@@ -43,7 +45,8 @@ mod writer;
 
 pub use error::Error;
 pub use hub::{Hub, PendingRender};
-pub use protocol::{BASE_PROTOCOL_VERSION, PROTOCOL_VERSION};
+pub use protocol::{BASE_PROTOCOL_VERSION, Control, PROTOCOL_VERSION};
+pub use range_scan::RangeScan;
 pub use robot::{MeshFormat, RobotDescription, RobotMesh, RobotState};
 pub use server::{Server, ServerConfig};
 pub use updates::{KeyframePose, LiveImage, LivePixels, ModelStatus, RunResult, SceneHint, Status};

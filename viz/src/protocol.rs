@@ -28,6 +28,8 @@ pub(crate) enum ClientMessage {
     Render(Box<RenderMessage>),
     /// Sets how often a topic is sent, and at which size.
     Subscribe(SubscribeMessage),
+    /// Controls the run.
+    Control(ControlMessage),
     /// Requests the server's time.
     Ping(ClientPing),
     /// The client disconnects.
@@ -60,6 +62,10 @@ pub(crate) enum Topic {
     RobotState,
     /// Points of each keyframe.
     KeyframePoints,
+    /// Scans of range scanners.
+    RangeScans,
+    /// The path of a moving base.
+    BasePath,
 }
 
 /// Fields of `subscribe`.
@@ -74,6 +80,26 @@ pub(crate) struct SubscribeMessage {
     pub(crate) camera: Option<String>,
     /// Maximum size of images.
     pub(crate) size_px: Option<[u32; 2]>,
+}
+
+/// Fields of `control`.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct ControlMessage {
+    /// What the run should do.
+    pub(crate) action: Control,
+}
+
+/// An action of an operator.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Control {
+    /// Stops training; keyframes are still accepted.
+    Pause,
+    /// Continues training.
+    Resume,
+    /// Writes a checkpoint.
+    Save,
 }
 
 /// Fields of `ping`.

@@ -128,6 +128,10 @@ impl Reader<'_> {
                 self.subscribe(message)?;
                 None
             }
+            ClientMessage::Control(message) => {
+                self.hub.control(message.action);
+                None
+            }
             ClientMessage::Ping(ping) => Some(Reply::Pong { t: ping.t }),
             ClientMessage::Goodbye(_) => Some(Reply::Goodbye { reason: "the client disconnected".to_owned() }),
         })
