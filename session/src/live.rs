@@ -348,6 +348,9 @@ impl Live {
             true => due[ix].saturating_sub(session.progress().step),
             false => u64::MAX,
         };
+        if self.pace == Pace::RealTime {
+            self.sessions.iter_mut().try_for_each(Session::end_growth_when_slow)?;
+        }
         let before = Instant::now();
         let step_before = self.sessions[0].progress().step;
         let (hub, budget) = (&self.hub, self.budget);

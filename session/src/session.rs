@@ -37,6 +37,8 @@ use training_time::TrainingTime;
 
 /// Approximate duration of a slice. The device is idle for a moment at the end of each slice.
 const TIME_SLICE: Duration = Duration::from_millis(40);
+/// Step time at which a live run stops growing its model. Pictures take about as long as steps.
+const MAX_LIVE_STEP_MILLIS: f64 = 300.0;
 
 /// A model in training.
 pub struct Session {
@@ -274,6 +276,22 @@ impl Session {
     pub(crate) fn end_size_search(&mut self) -> crate::Result<()> {
         if self.method.end_size_search()? {
             self.persistence.log_size_search_end(self.method.as_mut())?;
+        }
+        Ok(())
+    }
+
+    /// Keeps the size of the model from now on if its steps take too long for a live run. A larger model would be trained
+    /// and drawn even more slowly, so that an operator would see less.
+    pub(crate) fn end_growth_when_slow(&mut self) -> crate::Result<()> {
+        if self.progress().step_millis > MAX_LIVE_STEP_MILLIS { self.end_growth() } else { Ok(()) }
+    }
+
+    /// Keeps the size of the model from now on.
+    pub(crate) fn end_growth(&mut self) -> crate::Result<()> {
+        if self.method.end_growth()? {
+            let (primitives, step_millis) = (self.progress().primitives, self.progress().step_millis);
+            log::info!("the model stops growing at {primitives} splats, because a step takes {step_millis:.0} ms");
+            self.persistence.log_growth_end(self.method.as_mut())?;
         }
         Ok(())
     }

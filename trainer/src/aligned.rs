@@ -492,6 +492,10 @@ impl<M: Recalibrate + 'static> Method for Aligned<M> {
         self.model.end_size_search()
     }
 
+    fn end_growth(&mut self) -> Result<bool, Error> {
+        self.model.end_growth()
+    }
+
     fn progress(&self) -> Progress {
         self.model.progress()
     }

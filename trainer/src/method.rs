@@ -117,6 +117,10 @@ pub trait Method {
     fn end_size_search(&mut self) -> Result<bool, Error> {
         Ok(false)
     }
+    /// Keeps the size of the model from now on. Returns false if the model does not grow, or cannot stop now.
+    fn end_growth(&mut self) -> Result<bool, Error> {
+        Ok(false)
+    }
     /// Progress of training.
     fn progress(&self) -> Progress;
     /// Reports of the trials, in the order in which they ran.

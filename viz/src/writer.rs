@@ -302,7 +302,7 @@ impl Writer<'_> {
     }
 }
 
-fn encode(rendered: Box<(RenderJob, PictureHeader, Rendered)>, effort: Effort) -> EncodingTask {
+fn encode(rendered: Box<(RenderJob, PictureHeader, Rendered)>, effort: Option<Effort>) -> EncodingTask {
     let view_request = &rendered.0.view_request;
     let (id, view) = (view_request.id, Arc::clone(&view_request.view));
     let task = tokio::task::spawn_blocking(move || {

@@ -72,6 +72,14 @@ impl Persistence {
         Ok(())
     }
 
+    /// Logs that growth was ended.
+    pub(super) fn log_growth_end(&mut self, method: &mut dyn Method) -> crate::Result<()> {
+        if let Some(decisions) = &mut self.decisions {
+            decisions.growth_ended(method.n_total_steps()?);
+        }
+        Ok(())
+    }
+
     /// Logs that a picture is drawn. Drawing affects the result, because it creates splats for new keyframes.
     pub(super) fn log_render(&mut self) {
         if let Some(decisions) = &mut self.decisions {

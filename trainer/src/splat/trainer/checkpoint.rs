@@ -34,7 +34,7 @@ struct SavedState {
     step: u64,
     model: ModelState,
     n_non_finite: u32,
-    /// Whether memory was too small for more splats.
+    /// Whether the number of splats stays the same.
     #[serde(default)]
     is_full: bool,
     /// Training views. Their order determines the training order.

@@ -24,7 +24,7 @@ pub(super) struct TrainedModel {
     pub(super) splats: SplatBuffers,
     pub(super) cameras: CameraParams,
     max_splats: u32,
-    /// Whether the GPU has no memory left for more splats.
+    /// Whether the number of splats stays the same, because the GPU has no memory left or would be too slow.
     is_full: bool,
 }
 
@@ -126,12 +126,12 @@ impl TrainedModel {
         Ok(())
     }
 
-    /// Whether GPU memory is too small for more splats.
+    /// Whether the number of splats stays the same, except for new images within the reserved memory.
     pub(super) fn is_full(&self) -> bool {
         self.is_full
     }
 
-    /// Restores the result of [`Self::is_full`].
+    /// Sets the result of [`Self::is_full`].
     pub(super) fn set_full(&mut self, is_full: bool) {
         self.is_full = is_full;
     }
