@@ -14,7 +14,7 @@ const MAX_DEBT_SECS: f64 = 1.0;
 
 /// Credit per second of training.
 const CREDIT_ON_SOFTWARE: f64 = 1.0;
-const CREDIT_ON_GPU: f64 = 0.6;
+const CREDIT_ON_GPU: f64 = 0.66;
 
 /// The time available for pictures.
 #[derive(Clone, Copy, Debug, PartialEq)]
