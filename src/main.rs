@@ -8,6 +8,7 @@ mod console;
 mod data_args;
 mod exit;
 mod open_gpu;
+mod page_args;
 mod print;
 mod signals;
 mod training_args;

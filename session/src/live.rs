@@ -226,6 +226,10 @@ impl Live {
         if self.is_scoring() {
             return Ok(());
         }
+        if self.hub.is_paused() && self.pace != Pace::RealTime {
+            self.hub.wait_for_request(IDLE); // The next keyframe is due at a later step.
+            return Ok(());
+        }
         self.apply_alignments()?;
         if let Some(first_image) = self.feed.first_image() {
             self.sessions.iter_mut().for_each(|session| session.start_clock(first_image));
@@ -299,7 +303,7 @@ impl Live {
             self.budget.add_training(before.elapsed());
             return Ok(());
         }
-        if self.is_finished() {
+        if self.is_finished() || self.hub.is_paused() {
             self.hub.wait_for_request(IDLE);
             return Ok(());
         }
@@ -334,7 +338,7 @@ impl Live {
     /// Draws requested pictures as long as training keeps its share of the time.
     fn render(&mut self) -> crate::Result<()> {
         let started = Instant::now();
-        if !self.is_training() || self.is_idle() {
+        if !self.is_training() || self.is_idle() || self.hub.is_paused() {
             self.budget.refill(); // Training is idle, so drawing does not delay it.
         }
         while started.elapsed() < MAX_RENDER_TIME
@@ -374,7 +378,7 @@ impl Live {
     /// Queues steps behind pictures, which keeps the GPU busy while the pictures are delivered. Only for a single model in
     /// real time, where this needs no other work.
     fn queue_steps(&mut self) -> crate::Result<()> {
-        let is_training = self.is_training() && !self.is_idle() && !self.is_scoring();
+        let is_training = self.is_training() && !self.is_idle() && !self.is_scoring() && !self.hub.is_paused();
         let (Pace::RealTime, [session], true) = (self.pace, &mut self.sessions[..], is_training) else { return Ok(()) };
         if !session.is_over() {
             session.train_steps(u64::MAX)?;
@@ -493,6 +497,8 @@ impl Live {
     fn state(&self) -> &'static str {
         if self.is_finished() {
             "finished"
+        } else if self.hub.is_paused() {
+            "paused"
         } else if self.is_training() {
             "training"
         } else if self.feed.first_image().is_some() {

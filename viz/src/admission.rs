@@ -1,10 +1,11 @@
 //! Limits the number of open connections, so that enough file descriptors remain and connections in use stay open.
 //!
-//! All peers have loopback addresses, so viewers and idle sockets differ only in their behavior. At a limit, a new
+//! Addresses do not distinguish viewers from idle sockets: on this computer, all are the same. At a limit, a new
 //! connection replaces the least active one.
 
 use parking_lot::{Mutex, MutexGuard};
 use std::collections::BTreeMap;
+use std::future::poll_fn;
 use std::io;
 use std::pin::Pin;
 use std::sync::Arc;
@@ -322,6 +323,21 @@ impl GuardedStream {
     /// Its entry in the [`Admission`].
     pub(crate) fn connection(&self) -> &Arc<Connection> {
         &self.connection
+    }
+
+    /// Waits for the first byte from the peer, which stays unread.
+    pub(crate) async fn first_byte(&self) -> io::Result<u8> {
+        let mut byte = [0];
+        let n_bytes = poll_fn(|context| {
+            let mut state = self.connection.state();
+            if state.is_closed {
+                return Poll::Ready(Err(io::ErrorKind::ConnectionAborted.into()));
+            }
+            state.reader = Some(context.waker().clone());
+            self.stream.poll_peek(context, &mut ReadBuf::new(&mut byte))
+        })
+        .await?;
+        if n_bytes == 0 { Err(io::ErrorKind::UnexpectedEof.into()) } else { Ok(byte[0]) }
     }
 
     /// Applies [`Connection::set_send_buffer`]. A failure affects only latency.

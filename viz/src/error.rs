@@ -1,6 +1,7 @@
 //! Errors that occur when the server starts.
 
 use std::net::SocketAddr;
+use std::path::PathBuf;
 
 /// Errors of the render server.
 #[derive(Debug, thiserror::Error)]
@@ -14,14 +15,41 @@ pub enum Error {
         /// Requested address.
         address: SocketAddr,
     },
-    /// The address is reachable from other machines, and the server does not support encryption yet.
+    /// The address is reachable from other machines, and the server is not shared.
     #[error(
-        "the address {address} can be reached from other machines, but the server does not support TLS yet: \
-         listen on a loopback address such as 127.0.0.1:7007"
+        "other machines can reach the address {address}: add --share, which encrypts the page and requires a token"
     )]
     NotLoopback {
         /// Requested address.
         address: SocketAddr,
+    },
+    /// A certificate or its private key cannot be used.
+    #[error("cannot use the TLS certificate in {}: {reason}", file.display())]
+    Certificate {
+        /// File that was read.
+        file: PathBuf,
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// Other users can read the private key of the kept certificate.
+    #[error("other users of this computer can read the private key in {0}: run `chmod 600 {0}`", file.display())]
+    PublicKeyFile {
+        /// File with the key.
+        file: PathBuf,
+    },
+    /// The certificate that is kept across runs cannot be created.
+    #[error("cannot create the TLS certificate in {}", file.display())]
+    WriteCertificate {
+        /// File to create.
+        file: PathBuf,
+        /// Error of the operating system.
+        source: std::io::Error,
+    },
+    /// The TLS library rejected a certificate.
+    #[error("cannot set up TLS")]
+    Tls {
+        /// Error of the TLS library.
+        source: rustls::Error,
     },
     /// The operating system rejected the address.
     #[error("cannot listen on {address}")]

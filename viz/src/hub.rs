@@ -13,6 +13,7 @@ use keyframe::Keyframe;
 use kinematics::{Stamp, Transform};
 use parking_lot::{Condvar, Mutex, MutexGuard};
 use std::collections::BTreeMap;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Weak};
 use std::time::{Duration, Instant};
 use tokio::sync::{Notify, watch};
@@ -73,6 +74,8 @@ struct Shared {
     demands: Mutex<BTreeMap<u64, Demand>>,
     /// For each camera: transform `reported_from_corrected`.
     camera_corrections: Mutex<BTreeMap<Arc<str>, Transform>>,
+    /// Whether an operator has paused training.
+    is_paused: AtomicBool,
     queue: Mutex<Queue>,
     work_arrived: Condvar,
 }
@@ -145,6 +148,15 @@ impl Hub {
     /// Sets the current state of the robot.
     pub fn set_robot_state(&self, state: RobotState) {
         self.shared.robot_state.send_replace(Some(Arc::new(state)));
+    }
+
+    /// Whether an operator has paused training.
+    pub fn is_paused(&self) -> bool {
+        self.shared.is_paused.load(Ordering::Relaxed)
+    }
+
+    pub(crate) fn set_paused(&self, is_paused: bool) {
+        self.shared.is_paused.store(is_paused, Ordering::Relaxed);
     }
 
     /// Whether a client shows the images of any camera.

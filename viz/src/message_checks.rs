@@ -17,7 +17,7 @@ pub(crate) fn check_session(session: &str) {
             Ok(ClientMessage::Hello(hello)) => check_hello(&hello),
             Ok(ClientMessage::Render(message)) => check_render(&message),
             Ok(ClientMessage::Subscribe(message)) => check_subscription(&mut subscriptions, message),
-            Ok(ClientMessage::Ping(_) | ClientMessage::Goodbye(_)) | Err(_) => {}
+            Ok(ClientMessage::Pause(_) | ClientMessage::Ping(_) | ClientMessage::Goodbye(_)) | Err(_) => {}
         }
     }
 }

@@ -1,5 +1,6 @@
 //! The messages from clients, as in `docs/reference/protocol.md`.
 
+use crate::access::Role;
 use serde::{Deserialize, Serialize};
 
 /// Newest protocol version of the server.
@@ -28,10 +29,22 @@ pub(crate) enum ClientMessage {
     Render(Box<RenderMessage>),
     /// Sets how often a topic is sent, and at which size.
     Subscribe(SubscribeMessage),
+    /// Pauses or continues training.
+    Pause(PauseMessage),
     /// Requests the server's time.
     Ping(ClientPing),
     /// The client disconnects.
     Goodbye(ClientGoodbye),
+}
+
+impl ClientMessage {
+    /// The role that a client needs to send this message. Whatever changes the run requires an operator.
+    pub(crate) fn required_role(&self) -> Role {
+        match self {
+            Self::Hello(_) | Self::Render(_) | Self::Subscribe(_) | Self::Ping(_) | Self::Goodbye(_) => Role::Viewer,
+            Self::Pause(_) => Role::Operator,
+        }
+    }
 }
 
 /// Fields of a client's `hello`. Unknown fields are ignored, because newer clients may send more.
@@ -74,6 +87,14 @@ pub(crate) struct SubscribeMessage {
     pub(crate) camera: Option<String>,
     /// Maximum size of images.
     pub(crate) size_px: Option<[u32; 2]>,
+}
+
+/// Fields of `pause`.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct PauseMessage {
+    /// Whether training pauses.
+    pub(crate) is_paused: bool,
 }
 
 /// Fields of `ping`.

@@ -4,6 +4,7 @@
 //! parts and the kernel's buffer are so small that their transfer takes less than 100 ms. Everything else waits here,
 //! where newer data replaces older data.
 
+use crate::access::Role;
 use crate::admission::Connection;
 use crate::client_updates::{ClientUpdates, Next};
 use crate::hub::Demand;
@@ -54,6 +55,7 @@ pub(crate) struct Writer<'a> {
     pub(crate) sink: SplitSink<WebSocket, Message>,
     pub(crate) server_context: &'a ServerContext,
     pub(crate) client: u64,
+    pub(crate) role: Role,
     pub(crate) connection: &'a Connection,
     pub(crate) negotiated: Negotiated,
     pub(crate) link: LinkRate,
@@ -222,6 +224,7 @@ impl Writer<'_> {
             capabilities: &CAPABILITIES,
             server: concat!("fieldrig ", env!("CARGO_PKG_VERSION")),
             client: self.client,
+            role: self.role,
             max_size_px: [MAX_SIZE_PX; 2],
             default_stages: &DEFAULT_STAGES,
             clock_millis: self.server_context.clock.now_millis(),

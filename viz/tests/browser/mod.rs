@@ -31,7 +31,7 @@ impl Browser {
     /// Opens a page of this size in CSS pixels; the profile folder must be empty.
     pub(crate) fn open(program: &Path, profile: &Path, url: &str, [width, height]: [u32; 2]) -> Self {
         let mut process = Command::new(program)
-            .args(["--headless", "--no-sandbox", "--disable-quic", "--no-first-run"])
+            .args(["--headless", "--no-sandbox", "--disable-quic", "--no-first-run", "--ignore-certificate-errors"])
             .args(["--disable-background-networking", "--disable-component-update", "--disable-sync"])
             .args(["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--hide-scrollbars"])
             .args(["--remote-debugging-port=0", "--force-device-scale-factor=1"])

@@ -1,5 +1,6 @@
 // The operator's page: connects the connection, the view and the readouts.
 
+import { keepToken, showRole } from "./access";
 import { Banner } from "./banner";
 import { Connection } from "./connection";
 import { element } from "./element";
@@ -9,6 +10,7 @@ import { LinkReadout } from "./link_readout";
 import { LiveImages } from "./live_images";
 import { ModelSwitch } from "./model_switch";
 import { BACKGROUND, OrbitView } from "./orbit_view";
+import { PauseButton } from "./pause_button";
 import type { BinaryHeader, LiveImageHeader, PictureHeader, Status, TextMessage } from "./protocol";
 import { Readouts } from "./readouts";
 import { RenderScheduler } from "./render_scheduler";
@@ -23,7 +25,9 @@ let liveCamera: LiveImageHeader | null = null;
 const readouts = new Readouts();
 const banner = new Banner();
 const view = new OrbitView(element("canvas", HTMLCanvasElement), () => scheduler.moved());
-const connection = new Connection(`ws://${location.host}/ws`, {
+keepToken();
+window.addEventListener("hashchange", keepToken);
+const connection = new Connection(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/ws`, {
   state(state, text) {
     const shown = element("connection");
     const before = shown.dataset.state;
@@ -53,6 +57,7 @@ const robotAge = new RobotAge(view.robot, connection.clock);
 const subscriptions = new Subscriptions(connection);
 const keyframes = new KeyframeList();
 new LinkReadout(connection);
+const pauseButton = new PauseButton(connection);
 const models = new ModelSwitch(() => {
   scheduler.restart();
   if (latestStatus) showStatus(latestStatus);
@@ -63,6 +68,7 @@ function receiveText(message: TextMessage): void {
   switch (message.type) {
     case "hello":
       stages = message.default_stages;
+      showRole(message.role);
       break;
     case "status":
       latestStatus = message;
@@ -108,6 +114,7 @@ function receiveText(message: TextMessage): void {
 function showStatus(status: Status): void {
   const model = models.shown(status);
   readouts.show(status, model);
+  pauseButton.show(status);
   if (model.step !== latestStep) scheduler.modelChanged();
   latestStep = model.step;
 }

@@ -14,6 +14,7 @@ export const CAPABILITIES = [
   "heartbeat",
   "robot",
   "keyframe_points",
+  "pause",
 ] as const;
 export type Capability = (typeof CAPABILITIES)[number];
 
@@ -23,6 +24,9 @@ export interface Pinhole {
   principal_px: [number, number];
 }
 
+/** What the page may do; only operators can change the run. */
+export type Role = "viewer" | "operator";
+
 export interface Hello {
   type: "hello";
   protocol: number;
@@ -31,6 +35,8 @@ export interface Hello {
   capabilities?: string[];
   server: string;
   client: number;
+  /** Servers before the capability `pause` have none. */
+  role: Role | undefined;
   max_size_px: [number, number];
   default_stages: number[];
   clock_millis: number;
@@ -284,7 +290,13 @@ export interface PingMessage {
   t: number;
 }
 
-export type ClientMessage = HelloMessage | RenderMessage | SubscribeMessage | PingMessage;
+/** Pauses or continues training; only for operators. */
+export interface PauseMessage {
+  type: "pause";
+  is_paused: boolean;
+}
+
+export type ClientMessage = HelloMessage | RenderMessage | SubscribeMessage | PauseMessage | PingMessage;
 
 /** Header and payload of a binary message: u32 little-endian header length, JSON header, payload. */
 export function unframe(message: ArrayBuffer): {
