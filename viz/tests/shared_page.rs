@@ -120,7 +120,7 @@ fn other_sites_can_neither_embed_nor_use_the_page() {
         server.url()
     );
     let mut browser = Browser::open(&program, &profile, &serve_html(html), WINDOW_PX);
-    wait_for(&mut browser, "the socket", |browser| browser.text("socket") != "waiting");
+    wait_for(&mut browser, "the socket", |browser| ["open", "refused"].contains(&&*browser.text("socket")));
     assert_eq!(browser.text("socket"), "refused");
     let started = Instant::now();
     while started.elapsed() < BLOCKED_AFTER {
