@@ -10,6 +10,7 @@ mod exit;
 mod open_gpu;
 mod page_args;
 mod print;
+mod served_page;
 mod signals;
 mod training_args;
 

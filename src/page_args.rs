@@ -1,16 +1,12 @@
-//! Flags for the address of the page, and what is printed about it.
+//! Flags for the address of the page, and who may open it.
 
 use crate::exit::BadArgument;
-use crate::print;
+use crate::served_page::{ServedPage, Shared};
 use anyhow::Context;
-use qrcode::QrCode;
-use qrcode::render::unicode::Dense1x2;
-use serde_json::{Value, json};
 use session::next_commands::quoted;
-use std::io::IsTerminal;
-use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, UdpSocket};
+use std::net::{Ipv4Addr, SocketAddr};
 use std::path::PathBuf;
-use viz::{Certificate, Hub, Server, ServerConfig, Sharing, Token, Tokens};
+use viz::{Certificate, Hub, Server, ServerConfig, Sharing, Tokens};
 
 /// Where the page is served, and to whom.
 #[derive(Clone, Debug, clap::Args)]
@@ -28,6 +24,10 @@ pub(crate) struct PageArgs {
     /// Private key of --certificate (PEM) [default: it is in the same file]
     #[arg(long, value_name = "FILE", requires = "certificate")]
     certificate_key: Option<PathBuf>,
+    /// Also serve images, joint states, frames, keyframes and metrics to Foxglove at this loopback address
+    #[arg(long, value_name = "ADDRESS", num_args = 0..=1, require_equals = true,
+        default_missing_value = "127.0.0.1:8765", value_parser = address)]
+    foxglove: Option<SocketAddr>,
 }
 
 /// Parses the address of the page.
@@ -36,7 +36,7 @@ fn address(text: &str) -> Result<SocketAddr, String> {
 }
 
 impl PageArgs {
-    /// Rejects an address that other machines can reach, unless the page is shared.
+    /// Rejects an address that other machines can reach, unless the page is shared, and flags that this build lacks.
     pub(crate) fn check(&self) -> Result<(), BadArgument> {
         match self.listen {
             Some(address) if !address.ip().is_loopback() && !self.share => {
@@ -47,6 +47,10 @@ impl PageArgs {
                     command.join(" ")
                 )))
             }
+            _ if self.foxglove.is_some() && !cfg!(feature = "foxglove") => Err(BadArgument(
+                "--foxglove: this program was built without Foxglove support: build with `--features foxglove`"
+                    .to_owned(),
+            )),
             _ => Ok(()),
         }
     }
@@ -84,7 +88,12 @@ impl PageArgs {
         } else {
             (Server::start(config, hub.clone())?, None)
         };
-        Ok(ServedPage { server, shared })
+        Ok(ServedPage {
+            server,
+            shared,
+            #[cfg(feature = "foxglove")]
+            foxglove: self.foxglove.map(|address| viz::FoxgloveServer::start(address, hub.clone())).transpose()?,
+        })
     }
 
     fn share_at(&self, config: ServerConfig, hub: &Hub) -> anyhow::Result<(Server, Shared)> {
@@ -93,12 +102,10 @@ impl PageArgs {
             None => Certificate::kept_in(&data_folder()?)?,
         };
         let tokens = Tokens::random().context("cannot create a token")?;
-        let shared = Shared {
-            tokens: tokens.clone(),
-            fingerprint: certificate.fingerprint(),
-            is_self_signed: self.certificate.is_none(),
-        };
-        Ok((Server::start_shared(config, Sharing { certificate, tokens }, hub.clone())?, shared))
+        let (fingerprint, is_self_signed) = (certificate.fingerprint(), self.certificate.is_none());
+        let server = Server::start_shared(config, Sharing { certificate, tokens: tokens.clone() }, hub.clone())?;
+        let shared = Shared::new(server.address(), &tokens, fingerprint, is_self_signed);
+        Ok((server, shared))
     }
 }
 
@@ -109,112 +116,4 @@ fn data_folder() -> Result<PathBuf, BadArgument> {
     given.or_else(in_home).map(|folder| folder.join("fieldrig")).ok_or_else(|| {
         BadArgument("there is no home folder for the TLS certificate: set HOME, or use --certificate".to_owned())
     })
-}
-
-/// A page that is being served.
-pub(crate) struct ServedPage {
-    server: Server,
-    shared: Option<Shared>,
-}
-
-/// What clients of a shared page need to know.
-struct Shared {
-    tokens: Tokens,
-    fingerprint: String,
-    is_self_signed: bool,
-}
-
-impl ServedPage {
-    /// The address at which the server listens.
-    pub(crate) fn address(&self) -> SocketAddr {
-        self.server.address()
-    }
-
-    /// The address to open in a browser, as operator.
-    pub(crate) fn url(&self) -> String {
-        match &self.shared {
-            None => self.server.url(),
-            Some(shared) => shared_url(self.reachable_addresses()[0], self.address().port(), &shared.tokens.operator),
-        }
-    }
-
-    /// Prints the addresses to open in a browser, as an event with these `fields` if `is_json`.
-    pub(crate) fn print(&self, is_json: bool, fields: Value) -> anyhow::Result<()> {
-        let url = self.url();
-        let viewer_url = self
-            .shared
-            .as_ref()
-            .map(|shared| shared_url(self.reachable_addresses()[0], self.address().port(), &shared.tokens.viewer));
-        if is_json {
-            let mut event = json!({ "event": "serving", "url": url });
-            if let (Some(shared), Some(viewer_url)) = (&self.shared, viewer_url) {
-                event["viewer_url"] = json!(viewer_url);
-                event["certificate_sha256"] = json!(shared.fingerprint);
-            }
-            if let (Value::Object(event), Value::Object(fields)) = (&mut event, fields) {
-                event.extend(fields);
-            }
-            return print::report_json(&event);
-        }
-        print::report(format_args!("open {url} in a browser"));
-        if let (Some(shared), Some(viewer_url)) = (&self.shared, viewer_url) {
-            print::report(format_args!("to let others watch without control, give them {viewer_url}"));
-            if let [_, others @ ..] = &self.reachable_addresses()[..]
-                && !others.is_empty()
-            {
-                let others: Vec<String> = others.iter().map(ToString::to_string).collect();
-                print::report(format_args!("other addresses of this computer: {}", others.join(", ")));
-            }
-            let remark = if shared.is_self_signed { ", of which browsers warn once; compare this value" } else { "" };
-            print::report(format_args!("SHA-256 fingerprint of the certificate{remark}: {}", shared.fingerprint));
-            if std::io::stdout().is_terminal() {
-                print::report(qr_code(&url)?);
-            }
-        }
-        Ok(())
-    }
-
-    /// The addresses under which other machines may reach the page, the likeliest first; at least one.
-    fn reachable_addresses(&self) -> Vec<IpAddr> {
-        let listen = self.address().ip();
-        if !listen.is_unspecified() {
-            return vec![listen];
-        }
-        let interfaces = if_addrs::get_if_addrs().unwrap_or_else(|error| {
-            log::warn!("cannot list the network addresses of this computer: {error}");
-            Vec::new()
-        });
-        let mut addresses: Vec<IpAddr> = interfaces
-            .iter()
-            .filter(|interface| !interface.is_loopback() && !interface.is_link_local())
-            .map(|interface| interface.ip())
-            .filter(|address| address.is_ipv4() || listen.is_ipv6())
-            .collect();
-        let default = default_route_address();
-        addresses.sort_by_key(|address| (Some(*address) != default, address.is_ipv6()));
-        if addresses.is_empty() {
-            addresses.push(if listen.is_ipv4() { Ipv4Addr::LOCALHOST.into() } else { Ipv6Addr::LOCALHOST.into() });
-        }
-        addresses
-    }
-}
-
-/// This computer's address on the network with the default route, if there is one. No data is sent.
-fn default_route_address() -> Option<IpAddr> {
-    // An address for documentation (RFC 5737), which no network uses.
-    let socket = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, 0)).ok()?;
-    socket.connect((Ipv4Addr::new(192, 0, 2, 1), 9)).ok()?;
-    socket.local_addr().ok().map(|address| address.ip())
-}
-
-/// The token is in the fragment, which browsers send neither to servers nor to other sites.
-fn shared_url(address: IpAddr, port: u16, token: &Token) -> String {
-    format!("https://{}/#token={}", SocketAddr::new(address, port), token.text())
-}
-
-/// A QR code for terminals, dark on light whatever the terminal's colors.
-fn qr_code(text: &str) -> anyhow::Result<String> {
-    let code = QrCode::new(text).context("cannot create a QR code")?;
-    let lines = code.render::<Dense1x2>().build();
-    Ok(lines.lines().map(|line| format!("\x1b[30;107m{line}\x1b[0m")).collect::<Vec<_>>().join("\n"))
 }

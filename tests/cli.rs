@@ -123,6 +123,9 @@ fn unencrypted_pages_are_served_only_on_loopback_addresses() {
     assert_fails_with(&["run", &rig, "--sim", "--listen", "0.0.0.0:0"], 2, &["0.0.0.0", "token", &command]);
     assert_fails_with(&["view", "absent", "--listen", "[::]:0"], 2, &["'[::]:0' --share"]);
     assert_fails_with(&["view", "absent", "--certificate", "chain.pem"], 2, &["--share"]);
+    if cfg!(not(feature = "foxglove")) {
+        assert_fails_with(&["view", "absent", "--foxglove"], 2, &["--features foxglove"]);
+    }
 }
 
 #[test]

@@ -51,6 +51,23 @@ pub enum Error {
         /// Error of the TLS library.
         source: rustls::Error,
     },
+    /// The address for Foxglove is reachable from other machines.
+    #[error(
+        "other machines can reach the address {address}, and the protocol of Foxglove has no login: use a loopback address, \
+         and `ssh -L {port}:localhost:{port} HOST` on the other machine", port = address.port()
+    )]
+    FoxgloveNotLoopback {
+        /// Requested address.
+        address: SocketAddr,
+    },
+    /// The server for Foxglove could not start.
+    #[error("cannot serve Foxglove on {address}: {reason}")]
+    Foxglove {
+        /// Requested address.
+        address: SocketAddr,
+        /// Error of the Foxglove library.
+        reason: String,
+    },
     /// The operating system rejected the address.
     #[error("cannot listen on {address}")]
     Listen {

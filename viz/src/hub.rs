@@ -76,6 +76,8 @@ struct Shared {
     camera_corrections: Mutex<BTreeMap<Arc<str>, Transform>>,
     /// Whether an operator has paused training.
     is_paused: AtomicBool,
+    /// Whether somebody besides the clients needs images and robot states.
+    is_observed: AtomicBool,
     queue: Mutex<Queue>,
     work_arrived: Condvar,
 }
@@ -159,14 +161,25 @@ impl Hub {
         self.shared.is_paused.store(is_paused, Ordering::Relaxed);
     }
 
+    /// Sets whether somebody besides the clients needs images and robot states.
+    #[cfg(feature = "foxglove")]
+    pub(crate) fn set_observed(&self, is_observed: bool) {
+        self.shared.is_observed.store(is_observed, Ordering::Relaxed);
+    }
+
+    fn is_observed(&self) -> bool {
+        self.shared.is_observed.load(Ordering::Relaxed)
+    }
+
     /// Whether a client shows the images of any camera.
     pub fn needs_live_images(&self) -> bool {
-        self.shared.demands.lock().values().any(|demand| demand.subscriptions.has_live_images())
+        self.is_observed() || self.shared.demands.lock().values().any(|demand| demand.subscriptions.has_live_images())
     }
 
     /// Whether a client draws the robot.
     pub fn needs_robot_state(&self) -> bool {
-        self.shared.demands.lock().values().any(|demand| demand.subscriptions.robot_state.is_some())
+        self.is_observed()
+            || self.shared.demands.lock().values().any(|demand| demand.subscriptions.robot_state.is_some())
     }
 
     /// Sets the keyframes of which clients can draw points. They are not kept alive.

@@ -20,6 +20,8 @@ mod client_updates;
 mod clock;
 mod compact_depth;
 mod error;
+#[cfg(feature = "foxglove")]
+mod foxglove_server;
 mod hub;
 mod jpeg;
 mod keyframe_log;
@@ -47,6 +49,8 @@ mod writer;
 pub use access::{Role, Token, Tokens};
 pub use certificate::Certificate;
 pub use error::Error;
+#[cfg(feature = "foxglove")]
+pub use foxglove_server::FoxgloveServer;
 pub use hub::{Hub, PendingRender};
 pub use protocol::{BASE_PROTOCOL_VERSION, PROTOCOL_VERSION};
 pub use robot::{MeshFormat, RobotDescription, RobotMesh, RobotState};
