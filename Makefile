@@ -11,8 +11,8 @@
 # One feature set everywhere, so that dependencies compile once.
 FEATURES := --features sim
 
-# Tests also cover webcams through nokhwa, and RealSense cameras if their library is available: see `realsense`.
-TEST_FEATURES = $(FEATURES),nokhwa$(shell [ -e .deps/realsense/made-of ] && \
+# Tests also cover webcams through nokhwa, topics for Foxglove, and RealSense cameras if their library is available: see `realsense`.
+TEST_FEATURES = $(FEATURES),nokhwa,foxglove$(shell [ -e .deps/realsense/made-of ] && \
 	scripts/install-packages.sh --check realsense 2>/dev/null && echo ,realsense)
 
 # Rig that `make demo` simulates: name of a file in the folder rigs, without extension.

@@ -8,7 +8,9 @@ mod console;
 mod data_args;
 mod exit;
 mod open_gpu;
+mod page_args;
 mod print;
+mod served_page;
 mod signals;
 mod training_args;
 

@@ -116,10 +116,16 @@ fn missing_device_error_suggests_simulation() {
 }
 
 #[test]
-fn only_loopback_addresses_are_served() {
+fn unencrypted_pages_are_served_only_on_loopback_addresses() {
     let folder = tempfile::tempdir().expect("a folder");
     let rig = changed_rig(folder.path(), "seed = 1", "seed = 2");
-    assert_fails_with(&["run", &rig, "--sim", "--listen", "0.0.0.0:0"], 1, &["0.0.0.0"]);
+    let command = format!("`fieldrig run {rig} --sim --listen 0.0.0.0:0 --share`");
+    assert_fails_with(&["run", &rig, "--sim", "--listen", "0.0.0.0:0"], 2, &["0.0.0.0", "token", &command]);
+    assert_fails_with(&["view", "absent", "--listen", "[::]:0"], 2, &["'[::]:0' --share"]);
+    assert_fails_with(&["view", "absent", "--certificate", "chain.pem"], 2, &["--share"]);
+    if cfg!(not(feature = "foxglove")) {
+        assert_fails_with(&["view", "absent", "--foxglove"], 2, &["--features foxglove"]);
+    }
 }
 
 #[test]

@@ -3,7 +3,7 @@
 mod wall;
 
 use serde_json::{Value, json};
-use std::io::{BufRead, BufReader};
+use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{SocketAddr, TcpListener, TcpStream};
 use std::path::Path;
 use std::process::{Child, Command, ExitStatus, Stdio};
@@ -37,6 +37,7 @@ impl View {
             .args(["view", "--json"])
             .args(args)
             .current_dir(folder)
+            .env("XDG_DATA_HOME", folder.join("data-home"))
             .stdout(Stdio::piped())
             .spawn()
             .expect("fieldrig starts");
@@ -283,6 +284,40 @@ fn explicit_port_in_use_is_an_error_default_falls_back() {
     assert_ne!(view.address().port(), 7007);
     TcpStream::connect(view.address()).expect("the server listens");
     assert_eq!(view.interrupt().code(), Some(0));
+}
+
+#[cfg(unix)]
+#[test]
+fn shared_page_has_new_tokens_and_the_same_certificate() {
+    use std::os::unix::fs::PermissionsExt;
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    wall::write(&folder.join("data"), false, 0.0);
+    train(folder, &["data", "--steps", "1", "--max-splats", "500", "--out", "model"]);
+    let serve = || {
+        let view = View::start(folder, &["model", "--share", "--listen", "127.0.0.1:0"]);
+        let serving = view.serving.clone();
+        let text = |name: &str| serving[name].as_str().expect("text").to_owned();
+        let urls = [text("url"), text("viewer_url")];
+        let tokens = urls.each_ref().map(|url| {
+            let (address, token) = url.split_once("/#token=").expect("a token in the fragment");
+            let address = address.strip_prefix("https://").expect("https");
+            let mut stream = TcpStream::connect(address).expect("the server listens");
+            stream.write_all(b"GET / HTTP/1.0\r\n\r\n").expect("sent");
+            let mut answer = String::new();
+            let _ = stream.read_to_string(&mut answer); // A reset may follow the answer.
+            assert!(answer.contains("open its address with https://"), "{answer}");
+            token.to_owned()
+        });
+        assert_eq!(view.interrupt().code(), Some(0));
+        (tokens, text("certificate_sha256"))
+    };
+    let (first_tokens, first_fingerprint) = serve();
+    let (tokens, fingerprint) = serve();
+    assert_eq!(fingerprint, first_fingerprint);
+    assert_eq!(first_tokens.iter().chain(&tokens).collect::<std::collections::BTreeSet<_>>().len(), 4, "all differ");
+    let file = folder.join("data-home/fieldrig/page-certificate.pem");
+    assert_eq!(file.metadata().expect("it is kept").permissions().mode() & 0o777, 0o600);
 }
 
 #[test]

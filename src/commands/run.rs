@@ -5,6 +5,8 @@ use crate::checkpoint_args::CheckpointArgs;
 use crate::console::{Console, OutputMode, print_next_commands};
 use crate::exit::{self, BadArgument, Exit, InsufficientData};
 use crate::open_gpu::open_gpu;
+use crate::page_args::PageArgs;
+use crate::served_page::ServedPage;
 use crate::training_args::TrainingArgs;
 use crate::{print, signals};
 use anyhow::Context;
@@ -29,7 +31,6 @@ use session::{
 };
 use std::collections::BTreeMap;
 use std::io::IsTerminal;
-use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, OnceLock};
 use std::time::Duration;
@@ -37,7 +38,7 @@ use trainer::checkpoint::Checkpoint;
 use trainer::gpu::Gpu;
 use trainer::splat::CountPolicy;
 use trainer::{CommonOptions, ModelKind, ModelSpec, Resumed};
-use viz::{Hub, RunResult, Server, ServerConfig};
+use viz::{Hub, RunResult};
 
 /// Flags of `run`.
 #[derive(Clone, Debug, clap::Args)]
@@ -81,9 +82,8 @@ pub(crate) struct Args {
     steps_per_keyframe: Option<u64>,
     #[command(flatten)]
     training: TrainingArgs,
-    /// Address of the page: numeric IP address and port
-    #[arg(long, value_name = "ADDRESS", default_value = "127.0.0.1:7007", value_parser = address)]
-    listen: SocketAddr,
+    #[command(flatten)]
+    page: PageArgs,
     /// Folder for the results and the effective rig file; several methods get a subfolder each. A folder that contains
     /// a model is refused [default: a new folder in runs]
     #[arg(long, value_name = "FOLDER")]
@@ -105,11 +105,6 @@ enum WhenDone {
     Stay,
     /// Exit.
     Exit,
-}
-
-/// Parses the address of the page.
-pub(super) fn address(text: &str) -> Result<SocketAddr, String> {
-    text.parse().map_err(|_| "expected an address and a port, such as 127.0.0.1:7007".to_owned())
 }
 
 /// Names of the flags in checkpoints.
@@ -182,7 +177,7 @@ fn drive(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
             Err(error) => break Err(error),
         }
     };
-    let Running { live, rig, folders, damage, stop, server, .. } = running;
+    let Running { live, rig, folders, damage, stop, page, .. } = running;
     let hub = live.hub();
     if let Err(error) = result {
         stop.request();
@@ -201,7 +196,7 @@ fn drive(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
     stop.request();
     let (exit, models) = save(live, args, &rig, folders, &damage)?;
     if args.keeps_serving() && !models.is_empty() && !stop.signaled() {
-        print::report(format_args!("serving the page at {} until Ctrl-C", server.url()));
+        print::report(format_args!("serving the page at {} until Ctrl-C", page.url()));
         let shown = |FinishedModel { kind, method, .. }| ServedModel { kind, method };
         ModelViewer::new(models.into_iter().map(shown).collect(), hub).serve(&stop);
     }
@@ -236,7 +231,7 @@ fn publish_end(hub: &Hub, models: &[FinishedModel]) {
 pub(super) struct Running {
     pub(super) live: Live,
     pub(super) gpu: Arc<Gpu>,
-    pub(super) server: Server,
+    pub(super) page: ServedPage,
     stop: Stop,
     rig: Rig,
     folders: Vec<PathBuf>,
@@ -289,6 +284,7 @@ pub(super) fn start(
     previous: Option<&PreviousRun>,
     created: &mut CreatedFolders,
 ) -> anyhow::Result<Running> {
+    args.page.check()?;
     if let Some(out) = &args.out {
         run_folder::check_no_model(out)?;
         if args.resume.as_ref() != Some(out) {
@@ -336,7 +332,7 @@ pub(super) fn start(
         }
     };
     let hub = Hub::new();
-    let server = Server::start(ServerConfig { listen: args.listen }, hub.clone())?;
+    let page = args.page.serve(&hub)?;
     for finding in doctor::suspicious_values(&rig) {
         log::warn!("{finding}");
     }
@@ -344,7 +340,7 @@ pub(super) fn start(
     models.iter_mut().try_for_each(|model| model.method.prepare())?;
     let device_notes = Notes::default();
     let Opened { rig, source, damage, stamp_clock } = args.open(rig)?.with_tag_check(&device_notes)?;
-    args.print_address(&server.url())?;
+    page.print(args.json, serde_json::json!({}))?;
     let folders = created.make_each(args.out(), &kinds, Some(&rig))?;
     let held = previous.map_or(&[][..], |previous| &previous.keyframes);
     let (input, evicted) = args.input(&rig, (source, stamp_clock), held)?;
@@ -419,7 +415,7 @@ pub(super) fn start(
 
     let held = sessions.first().map_or(Vec::new(), |session| session.keyframes().to_vec());
     let live = Live::new(sessions, feed, hub, options).resume_from(held);
-    Ok(Running { live, gpu, server, stop, rig, folders, damage })
+    Ok(Running { live, gpu, page, stop, rig, folders, damage })
 }
 
 /// Closes the recording and writes the keyframe lists after a GPU failure. Returns the error with a note of what was
@@ -672,14 +668,6 @@ impl Args {
         let path = self.record.as_ref().or(self.from.as_ref()).filter(|_| self.resume.is_none()).cloned();
         let rig = folder.join(drivers::recording::RIG_FILE).display().to_string();
         DataSource { path, flags: vec!["--rig".to_owned(), rig], ..DataSource::default() }
-    }
-
-    fn print_address(&self, url: &str) -> anyhow::Result<()> {
-        if self.json {
-            return print::report_json(&serde_json::json!({ "event": "serving", "url": url }));
-        }
-        print::report(format_args!("open {url} in a browser"));
-        Ok(())
     }
 
     fn open(&self, rig: Rig) -> anyhow::Result<Opened> {

@@ -1,26 +1,25 @@
 //! `fieldrig view`: serves saved models on the web page.
 
-use super::run::{address, notes};
+use super::run::notes;
 use crate::exit::{BadArgument, Exit};
 use crate::open_gpu::open_gpu;
-use crate::{print, signals};
+use crate::page_args::PageArgs;
+use crate::signals;
 use kinematics::Transform;
 use nalgebra::{Translation3, UnitQuaternion, Vector3};
 use serde_json::{Value, json};
 use session::{ModelViewer, ServedModel, camera_list, methods, run_folder, scene_hint};
-use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use trainer::{Bounds, LoadedModel, ModelKind, Progress};
-use viz::{Hub, KeyframePose, ModelStatus, SceneHint, Server, ServerConfig, Status};
+use viz::{Hub, KeyframePose, ModelStatus, SceneHint, Status};
 
 /// Flags of `view`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
     /// Folder of a saved model or of a run with several methods, or a splat file (.ply, .spz)
     model: PathBuf,
-    /// Address of the page: numeric IP address and port [default: 127.0.0.1:7007, or a free port if that one is in use]
-    #[arg(long, value_name = "ADDRESS", value_parser = address)]
-    listen: Option<SocketAddr>,
+    #[command(flatten)]
+    page: PageArgs,
     /// Axis of the model that points up: x, y, z, -x, -y or -z; files from other programs are often -y up
     #[arg(long, value_name = "AXIS", default_value = "z", allow_hyphen_values = true, value_parser = up_axis)]
     up: Up,
@@ -56,13 +55,14 @@ impl Up {
 
 /// Serves the page until Ctrl-C.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
+    args.page.check()?;
     check_is_model(&args.model)?;
     let paths = run_folder::models_at(&args.model)?;
     let stop = signals::stop_on_signals_logging("stopping; Ctrl-C again exits at once")?;
     let gpu = open_gpu()?;
     let hub = Hub::new();
     // Before the models are loaded, so that an address in use is reported at once.
-    let server = start_server(args.listen, &hub)?;
+    let page = args.page.serve_or_free_port(&hub)?;
 
     let model_from_page = args.up.model_from_page();
     let cameras = cameras(&paths);
@@ -88,35 +88,11 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     hub.set_keyframes(cameras);
     hub.set_status(status);
 
-    args.print_url(&server.url(), &models)?;
+    let methods: Vec<&str> = models.iter().map(|model| model.kind.name()).collect();
+    page.print(args.json, json!({ "methods": methods }))?;
     let models = models.into_iter().map(|LoadedModel { kind, method }| ServedModel { kind, method }).collect();
     ModelViewer::new(models, hub).with_model_from_page(model_from_page).serve(&stop);
     Ok(Exit::Done)
-}
-
-impl Args {
-    fn print_url(&self, url: &str, models: &[LoadedModel]) -> anyhow::Result<()> {
-        if self.json {
-            let methods: Vec<&str> = models.iter().map(|model| model.kind.name()).collect();
-            return print::report_json(&json!({ "event": "serving", "url": url, "methods": methods }));
-        }
-        print::report(format_args!("open {url} in a browser"));
-        Ok(())
-    }
-}
-
-/// Starts the server at the given address; without one, at the default address or, if that is in use, at a free port.
-fn start_server(listen: Option<SocketAddr>, hub: &Hub) -> Result<Server, viz::Error> {
-    let default_config = ServerConfig::default();
-    match (listen, Server::start(listen.map_or(default_config, |listen| ServerConfig { listen }), hub.clone())) {
-        (None, Err(viz::Error::AddressInUse { address })) => {
-            log::info!("{address} is in use by another program; using a free port");
-            let mut listen = default_config.listen;
-            listen.set_port(0);
-            Server::start(ServerConfig { listen }, hub.clone())
-        }
-        (_, started) => started,
-    }
 }
 
 /// Rejects paths that are often mistaken for a model. The error names the command to use instead.

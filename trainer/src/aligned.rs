@@ -492,8 +492,8 @@ impl<M: Recalibrate + 'static> Method for Aligned<M> {
         self.model.end_size_search()
     }
 
-    fn end_growth(&mut self) -> Result<bool, Error> {
-        self.model.end_growth()
+    fn pause_growth(&mut self, is_paused: bool) -> Result<bool, Error> {
+        self.model.pause_growth(is_paused)
     }
 
     fn progress(&self) -> Progress {

@@ -117,8 +117,8 @@ pub trait Method {
     fn end_size_search(&mut self) -> Result<bool, Error> {
         Ok(false)
     }
-    /// Keeps the size of the model from now on. Returns false if the model does not grow, or cannot stop now.
-    fn end_growth(&mut self) -> Result<bool, Error> {
+    /// Pauses or continues the growth of the model. Returns false if this changes nothing, or is not possible now.
+    fn pause_growth(&mut self, _is_paused: bool) -> Result<bool, Error> {
         Ok(false)
     }
     /// Progress of training.

@@ -1,10 +1,11 @@
 //! Limits the number of open connections, so that enough file descriptors remain and connections in use stay open.
 //!
-//! All peers have loopback addresses, so viewers and idle sockets differ only in their behavior. At a limit, a new
+//! Addresses do not distinguish viewers from idle sockets: on this computer, all are the same. At a limit, a new
 //! connection replaces the least active one.
 
 use parking_lot::{Mutex, MutexGuard};
 use std::collections::BTreeMap;
+use std::future::poll_fn;
 use std::io;
 use std::pin::Pin;
 use std::sync::Arc;
@@ -81,6 +82,8 @@ struct Registry {
 #[derive(Debug)]
 pub(crate) struct Connection {
     number: u64,
+    /// Whether the peer has a loopback address. It may still be the end of a tunnel.
+    is_loopback: bool,
     /// Size that the kernel's send buffer should have, bytes; 0 if it should not change.
     send_buffer_bytes: AtomicUsize,
     state: Mutex<ConnectionState>,
@@ -132,10 +135,11 @@ impl Admission {
 
     /// Adds an accepted connection. Returns whether another one was closed to make room.
     pub(crate) fn admit(self: &Arc<Self>, stream: TcpStream) -> (GuardedStream, bool) {
+        let is_loopback = stream.peer_addr().is_ok_and(|peer| peer.ip().to_canonical().is_loopback());
         let has_evicted = self.registry().connections.len() >= self.limits.connections && self.evict();
         let mut registry = self.registry();
         registry.n_opened += 1;
-        let connection = Arc::new(Connection::new(registry.n_opened));
+        let connection = Arc::new(Connection::new(registry.n_opened, is_loopback));
         registry.connections.insert(connection.number, Arc::clone(&connection));
         drop(registry);
         (GuardedStream { stream, connection, admission: Arc::clone(self) }, has_evicted)
@@ -201,7 +205,7 @@ impl Admission {
 }
 
 impl Connection {
-    fn new(number: u64) -> Self {
+    fn new(number: u64, is_loopback: bool) -> Self {
         let state = ConnectionState {
             is_closed: false,
             reader: None,
@@ -212,7 +216,12 @@ impl Connection {
             opened: Instant::now(),
             client: None,
         };
-        Self { number, send_buffer_bytes: AtomicUsize::new(0), state: Mutex::new(state) }
+        Self { number, is_loopback, send_buffer_bytes: AtomicUsize::new(0), state: Mutex::new(state) }
+    }
+
+    /// Whether the peer has a loopback address.
+    pub(crate) fn is_loopback(&self) -> bool {
+        self.is_loopback
     }
 
     /// Records that a complete request has arrived.
@@ -322,6 +331,21 @@ impl GuardedStream {
     /// Its entry in the [`Admission`].
     pub(crate) fn connection(&self) -> &Arc<Connection> {
         &self.connection
+    }
+
+    /// Waits for the first byte from the peer, which stays unread.
+    pub(crate) async fn first_byte(&self) -> io::Result<u8> {
+        let mut byte = [0];
+        let n_bytes = poll_fn(|context| {
+            let mut state = self.connection.state();
+            if state.is_closed {
+                return Poll::Ready(Err(io::ErrorKind::ConnectionAborted.into()));
+            }
+            state.reader = Some(context.waker().clone());
+            self.stream.poll_peek(context, &mut ReadBuf::new(&mut byte))
+        })
+        .await?;
+        if n_bytes == 0 { Err(io::ErrorKind::UnexpectedEof.into()) } else { Ok(byte[0]) }
     }
 
     /// Applies [`Connection::set_send_buffer`]. A failure affects only latency.

@@ -1,6 +1,7 @@
 //! Errors that occur when the server starts.
 
 use std::net::SocketAddr;
+use std::path::PathBuf;
 
 /// Errors of the render server.
 #[derive(Debug, thiserror::Error)]
@@ -14,14 +15,58 @@ pub enum Error {
         /// Requested address.
         address: SocketAddr,
     },
-    /// The address is reachable from other machines, and the server does not support encryption yet.
+    /// The address is reachable from other machines, and the server is not shared.
     #[error(
-        "the address {address} can be reached from other machines, but the server does not support TLS yet: \
-         listen on a loopback address such as 127.0.0.1:7007"
+        "other machines can reach the address {address}: add --share, which encrypts the page and requires a token"
     )]
     NotLoopback {
         /// Requested address.
         address: SocketAddr,
+    },
+    /// A certificate or its private key cannot be used.
+    #[error("cannot use the TLS certificate in {}: {reason}", file.display())]
+    Certificate {
+        /// File that was read.
+        file: PathBuf,
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// Other users can read the private key of the kept certificate.
+    #[error("other users of this computer can read the private key in {0}: run `chmod 600 {0}`", file.display())]
+    PublicKeyFile {
+        /// File with the key.
+        file: PathBuf,
+    },
+    /// The certificate that is kept across runs cannot be created.
+    #[error("cannot create the TLS certificate in {}", file.display())]
+    WriteCertificate {
+        /// File to create.
+        file: PathBuf,
+        /// Error of the operating system.
+        source: std::io::Error,
+    },
+    /// The TLS library rejected a certificate.
+    #[error("cannot set up TLS")]
+    Tls {
+        /// Error of the TLS library.
+        source: rustls::Error,
+    },
+    /// The address for Foxglove is reachable from other machines.
+    #[error(
+        "other machines can reach the address {address}, and the protocol of Foxglove has no login: use a loopback address, \
+         and `ssh -L {port}:localhost:{port} HOST` on the other machine", port = address.port()
+    )]
+    FoxgloveNotLoopback {
+        /// Requested address.
+        address: SocketAddr,
+    },
+    /// The server for Foxglove could not start.
+    #[error("cannot serve Foxglove on {address}: {reason}")]
+    Foxglove {
+        /// Requested address.
+        address: SocketAddr,
+        /// Error of the Foxglove library.
+        reason: String,
     },
     /// The operating system rejected the address.
     #[error("cannot listen on {address}")]

@@ -15,6 +15,7 @@ use keyframe::Keyframe;
 use kinematics::{Stamp, Transform};
 use parking_lot::{Condvar, Mutex, MutexGuard};
 use std::collections::BTreeMap;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Weak};
 use std::time::{Duration, Instant};
 use tokio::sync::{Notify, watch};
@@ -86,6 +87,8 @@ struct Shared {
     camera_corrections: Mutex<BTreeMap<Arc<str>, Transform>>,
     /// Actions that the run has not taken yet, without repetitions.
     controls: Mutex<Vec<Control>>,
+    /// Whether somebody besides the clients needs images and robot states.
+    is_observed: AtomicBool,
     queue: Mutex<Queue>,
     work_arrived: Condvar,
 }
@@ -162,15 +165,27 @@ impl Hub {
         self.shared.robot_state.send_replace(Some(Arc::new(state)));
     }
 
+    /// Sets whether somebody besides the clients needs images and robot states.
+    #[cfg(feature = "foxglove")]
+    pub(crate) fn set_observed(&self, is_observed: bool) {
+        self.shared.is_observed.store(is_observed, Ordering::Relaxed);
+    }
+
+    fn is_observed(&self) -> bool {
+        self.shared.is_observed.load(Ordering::Relaxed)
+    }
+
     /// Whether a client shows the images of any camera.
     pub fn needs_live_images(&self) -> bool {
-        self.shared.demands.lock().values().any(|demand| demand.subscriptions.has_live_images())
+        self.is_observed() || self.shared.demands.lock().values().any(|demand| demand.subscriptions.has_live_images())
     }
 
     /// Whether a client draws the robot, or the path of its base is due.
     pub fn needs_robot_state(&self) -> bool {
         let is_path_due = self.shared.path_extended.lock().is_none_or(|at| at.elapsed() >= PATH_PERIOD);
-        is_path_due || self.shared.demands.lock().values().any(|demand| demand.subscriptions.robot_state.is_some())
+        self.is_observed()
+            || is_path_due
+            || self.shared.demands.lock().values().any(|demand| demand.subscriptions.robot_state.is_some())
     }
 
     /// Sets the latest scan of a range scanner. It is encoded later, on another thread, and only for clients that show

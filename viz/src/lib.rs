@@ -12,13 +12,17 @@
 //! assert!(hub.next_request().is_none(), "nobody requests a picture yet");
 //! ```
 
+mod access;
 mod admission;
 mod base_path;
 mod broadcast;
+mod certificate;
 mod client_updates;
 mod clock;
 mod compact_depth;
 mod error;
+#[cfg(feature = "foxglove")]
+mod foxglove_server;
 mod hub;
 mod jpeg;
 mod keyframe_log;
@@ -39,16 +43,21 @@ mod server_context;
 mod server_message;
 mod session;
 mod subscriptions;
+mod tls;
 mod updates;
 mod view_request;
 mod writer;
 
+pub use access::{Role, Token, Tokens};
+pub use certificate::Certificate;
 pub use error::Error;
+#[cfg(feature = "foxglove")]
+pub use foxglove_server::FoxgloveServer;
 pub use hub::{Hub, PendingRender};
 pub use protocol::{BASE_PROTOCOL_VERSION, Control, PROTOCOL_VERSION};
 pub use range_scan::RangeScan;
 pub use robot::{MeshFormat, RobotDescription, RobotMesh, RobotState};
-pub use server::{Server, ServerConfig};
+pub use server::{Server, ServerConfig, Sharing};
 pub use updates::{KeyframePose, LiveImage, LivePixels, ModelStatus, RunResult, SceneHint, Status};
 
 /// Handles the messages of a client, one per line, and panics if a result is inconsistent.

@@ -7,6 +7,7 @@ use crate::protocol::DepthFormat;
 use crate::server_message::{BinaryHeader, ColorPart, DepthPart, LiveHeader, PictureHeader, frame};
 use crate::updates::{LiveImage, LivePixels};
 use crate::view_request::ViewRequest;
+use std::borrow::Cow;
 use std::time::Instant;
 use trainer::{JPEG_QUALITY, PackedDepth, Packing, Picture, Rendered};
 
@@ -120,9 +121,15 @@ fn pack_color(picture: &Picture, is_last: bool) -> Result<Vec<u8>, JpegError> {
 
 /// The binary message of a live image, downscaled to `size_px`.
 pub(crate) fn pack_live_image(image: &LiveImage, size_px: [u32; 2], clock: ServerClock) -> Result<Vec<u8>, PackError> {
+    let jpeg = live_jpeg(image, size_px)?;
+    Ok(frame(&BinaryHeader::LiveImage(&LiveHeader::new(image, size_px, clock)), &[&jpeg]))
+}
+
+/// The JPEG file of a live image, downscaled to `size_px`.
+pub(crate) fn live_jpeg(image: &LiveImage, size_px: [u32; 2]) -> Result<Cow<'_, [u8]>, PackError> {
     let decoded;
     let pixels = match &image.pixels {
-        LivePixels::Jpeg(file) if size_px == image.size_px => return Ok(live_message(image, size_px, file, clock)),
+        LivePixels::Jpeg(file) if size_px == image.size_px => return Ok(Cow::Borrowed(file)),
         LivePixels::Jpeg(file) => {
             decoded = image::load_from_memory_with_format(file, image::ImageFormat::Jpeg)?.into_rgb8();
             let got = [decoded.width(), decoded.height()];
@@ -135,16 +142,10 @@ pub(crate) fn pack_live_image(image: &LiveImage, size_px: [u32; 2], clock: Serve
         LivePixels::Rgba(bytes) => Pixels { size_px: image.size_px, layout: Layout::Rgba, bytes },
     };
     if size_px == image.size_px {
-        let jpeg = encode(&pixels, QUALITY_LIVE, Chroma::Halved)?;
-        return Ok(live_message(image, size_px, &jpeg, clock));
+        return Ok(Cow::Owned(encode(&pixels, QUALITY_LIVE, Chroma::Halved)?));
     }
     let rgb = downscale(&pixels, size_px)?;
-    let jpeg = encode(&Pixels { size_px, layout: Layout::Rgb, bytes: &rgb }, QUALITY_LIVE, Chroma::Halved)?;
-    Ok(live_message(image, size_px, &jpeg, clock))
-}
-
-fn live_message(image: &LiveImage, size_px: [u32; 2], jpeg: &[u8], clock: ServerClock) -> Vec<u8> {
-    frame(&BinaryHeader::LiveImage(&LiveHeader::new(image, size_px, clock)), &[jpeg])
+    Ok(Cow::Owned(encode(&Pixels { size_px, layout: Layout::Rgb, bytes: &rgb }, QUALITY_LIVE, Chroma::Halved)?))
 }
 
 fn pack_depth(format: DepthFormat, picture: &Picture) -> Result<PackedDepth, PackError> {

@@ -1,5 +1,6 @@
 //! The messages from clients, as in `docs/reference/protocol.md`.
 
+use crate::access::Role;
 use serde::{Deserialize, Serialize};
 
 /// Newest protocol version of the server.
@@ -34,6 +35,16 @@ pub(crate) enum ClientMessage {
     Ping(ClientPing),
     /// The client disconnects.
     Goodbye(ClientGoodbye),
+}
+
+impl ClientMessage {
+    /// The role that a client needs to send this message. Whatever changes the run requires an operator.
+    pub(crate) fn required_role(&self) -> Role {
+        match self {
+            Self::Hello(_) | Self::Render(_) | Self::Subscribe(_) | Self::Ping(_) | Self::Goodbye(_) => Role::Viewer,
+            Self::Control(_) => Role::Operator,
+        }
+    }
 }
 
 /// Fields of a client's `hello`. Unknown fields are ignored, because newer clients may send more.

@@ -1,16 +1,17 @@
 //! Serves the page, the status and the WebSocket on one port, on a separate thread.
 
+use crate::access::{Access, Role, Tokens};
 use crate::admission::{Admission, Connection, GuardedStream, Limits};
 use crate::broadcast::broadcast;
+use crate::certificate::Certificate;
 use crate::clock::ServerClock;
 use crate::page::{FILES, has_version};
 use crate::protocol::MAX_MESSAGE_BYTES;
 use crate::server_context::ServerContext;
-use crate::session;
-use crate::{Error, Hub, Status};
+use crate::{Error, Hub, Status, session, tls};
 use axum::extract::{Extension, Path, Request, State, WebSocketUpgrade};
 use axum::http::{HeaderMap, HeaderName, HeaderValue, StatusCode, header};
-use axum::middleware::{Next, from_fn};
+use axum::middleware::{Next, from_fn, from_fn_with_state};
 use axum::response::{IntoResponse, Response};
 use axum::routing::get;
 use axum::{Router, body::Body};
@@ -24,7 +25,9 @@ use std::net::{IpAddr, Ipv4Addr, SocketAddr, TcpListener};
 use std::sync::Arc;
 use std::thread::JoinHandle;
 use std::time::Duration;
+use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::sync::watch;
+use tokio_rustls::TlsAcceptor;
 
 /// Maximum time that a stopping server waits until its clients have received the goodbye.
 const GOODBYE_TIMEOUT: Duration = Duration::from_millis(500);
@@ -51,7 +54,7 @@ const CONTENT_SECURITY_POLICY: &str = "default-src 'self'; img-src 'self' data: 
 /// Configuration of the server.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ServerConfig {
-    /// A loopback address; port 0 selects a free port.
+    /// Port 0 selects a free port.
     pub listen: SocketAddr,
 }
 
@@ -61,22 +64,43 @@ impl Default for ServerConfig {
     }
 }
 
+/// What makes a server safe to reach from other machines.
+#[derive(Debug)]
+pub struct Sharing {
+    /// Encrypts all connections.
+    pub certificate: Certificate,
+    /// Clients need one of them.
+    pub tokens: Tokens,
+}
+
 /// A running server. Dropping it sends a goodbye to all clients and frees the port.
 #[derive(Debug)]
 pub struct Server {
     address: SocketAddr,
+    scheme: &'static str,
     stop: watch::Sender<bool>,
     thread: Option<JoinHandle<()>>,
 }
 
 impl Server {
-    /// Starts listening, and serves the hub's data until dropped.
+    /// Starts listening on a loopback address, and serves the hub's data to everybody on this computer until dropped.
     pub fn start(config: ServerConfig, hub: Hub) -> Result<Self, Error> {
-        let listen_address = config.listen;
-        if !listen_address.ip().is_loopback() {
-            return Err(Error::NotLoopback { address: listen_address });
+        let address = config.listen;
+        if !address.ip().is_loopback() {
+            return Err(Error::NotLoopback { address });
         }
+        Self::spawn(address, hub, Access::Local, None)
+    }
+
+    /// Starts listening on any address, and serves the hub's data over TLS to clients with a token until dropped.
+    pub fn start_shared(config: ServerConfig, sharing: Sharing, hub: Hub) -> Result<Self, Error> {
+        let tls = sharing.certificate.server_config().map_err(|source| Error::Tls { source })?;
+        Self::spawn(config.listen, hub, Access::Tokens(sharing.tokens), Some(tls.into()))
+    }
+
+    fn spawn(listen_address: SocketAddr, hub: Hub, access: Access, tls: Option<TlsAcceptor>) -> Result<Self, Error> {
         let (listener, address) = listen(listen_address)?;
+        let scheme = if tls.is_some() { "https" } else { "http" };
         let (stop, stopped) = watch::channel(false);
         let runtime = tokio::runtime::Builder::new_current_thread()
             .enable_all()
@@ -85,14 +109,14 @@ impl Server {
         let thread = std::thread::Builder::new()
             .name("viz-server".to_owned())
             .spawn(move || {
-                if let Err(error) = runtime.block_on(serve(listener, hub, stopped)) {
+                if let Err(error) = runtime.block_on(serve(listener, hub, access, tls, stopped)) {
                     log::error!("the server on {address} stopped: {error}");
                 }
                 // Does not wait for pictures that are still being encoded.
                 runtime.shutdown_background();
             })
             .map_err(|source| Error::Thread { source })?;
-        Ok(Self { address, stop, thread: Some(thread) })
+        Ok(Self { address, scheme, stop, thread: Some(thread) })
     }
 
     /// The actual address, with the selected port.
@@ -100,9 +124,9 @@ impl Server {
         self.address
     }
 
-    /// The URL to open in a browser.
+    /// The URL to open in a browser on this computer. Clients of a shared server also need a token.
     pub fn url(&self) -> String {
-        format!("http://{}/", self.address)
+        format!("{}://{}/", self.scheme, self.address)
     }
 }
 
@@ -126,7 +150,13 @@ fn listen(address: SocketAddr) -> Result<(TcpListener, SocketAddr), Error> {
     Ok((listener, bound))
 }
 
-async fn serve(listener: TcpListener, hub: Hub, mut stopped: watch::Receiver<bool>) -> std::io::Result<()> {
+async fn serve(
+    listener: TcpListener,
+    hub: Hub,
+    access: Access,
+    tls: Option<TlsAcceptor>,
+    mut stopped: watch::Receiver<bool>,
+) -> std::io::Result<()> {
     #[cfg(unix)]
     set_socket_options(&listener);
     let listener = tokio::net::TcpListener::from_std(listener)?;
@@ -135,9 +165,13 @@ async fn serve(listener: TcpListener, hub: Hub, mut stopped: watch::Receiver<boo
     tokio::spawn(broadcast(hub.clone(), clock, latest_messages_sender));
     let admission = Admission::new(Limits::of_process());
     let server_context = ServerContext { hub: hub.clone(), clock, latest_messages, stopped: stopped.clone() };
-    let app = TowerToHyperService::new(router(AppState { server_context, admission: Arc::clone(&admission) }));
+    let app = TowerToHyperService::new(router(AppState {
+        server_context,
+        admission: Arc::clone(&admission),
+        access: Arc::new(access),
+    }));
     tokio::select! {
-        () = accept(&listener, &admission, &app) => {}
+        () = accept(&listener, &admission, tls.as_ref(), &app) => {}
         () = sweep(&admission) => {}
         _ = stopped.changed() => {}
     }
@@ -164,7 +198,12 @@ fn set_socket_options(listener: &TcpListener) {
 }
 
 /// Accepts connections and serves each in a separate task. Never returns.
-async fn accept(listener: &tokio::net::TcpListener, admission: &Arc<Admission>, app: &TowerToHyperService<Router>) {
+async fn accept(
+    listener: &tokio::net::TcpListener,
+    admission: &Arc<Admission>,
+    tls: Option<&TlsAcceptor>,
+    app: &TowerToHyperService<Router>,
+) {
     let mut is_failing = false;
     loop {
         match listener.accept().await {
@@ -175,7 +214,7 @@ async fn accept(listener: &tokio::net::TcpListener, admission: &Arc<Admission>, 
                     log::debug!("cannot disable Nagle's algorithm: {error}");
                 }
                 let (stream, has_evicted) = admission.admit(stream);
-                tokio::spawn(serve_connection(stream, app.clone()));
+                tokio::spawn(serve_connection(stream, tls.cloned(), app.clone()));
                 if has_evicted {
                     // Lets the task of the closed connection release its descriptor before the next accept.
                     tokio::task::yield_now().await;
@@ -204,8 +243,21 @@ async fn sweep(admission: &Admission) {
     }
 }
 
-async fn serve_connection(stream: GuardedStream, app: TowerToHyperService<Router>) {
+async fn serve_connection(stream: GuardedStream, tls: Option<TlsAcceptor>, app: TowerToHyperService<Router>) {
     let connection = Arc::clone(stream.connection());
+    match tls {
+        None => serve_requests(stream, connection, app).await,
+        Some(acceptor) => match tls::accept(&acceptor, stream).await {
+            Ok(stream) => serve_requests(stream, connection, app).await,
+            Err(error) => log::debug!("a connection failed: {error}"),
+        },
+    }
+}
+
+async fn serve_requests<S>(stream: S, connection: Arc<Connection>, app: TowerToHyperService<Router>)
+where
+    S: AsyncRead + AsyncWrite + Send + Unpin + 'static,
+{
     let service = hyper::service::service_fn(|request: hyper::Request<hyper::body::Incoming>| {
         connection.requested();
         let mut request = request.map(Body::new);
@@ -229,15 +281,23 @@ async fn serve_connection(stream: GuardedStream, app: TowerToHyperService<Router
 struct AppState {
     server_context: ServerContext,
     admission: Arc<Admission>,
+    access: Arc<Access>,
 }
 
 fn router(app_state: AppState) -> Router {
-    let mut router =
-        Router::new().route("/status", get(status)).route("/robot/{mesh}", get(robot_mesh)).route("/ws", get(connect));
+    let mut router = Router::new()
+        .route("/status", get(status))
+        .route("/robot/{mesh}", get(robot_mesh))
+        .route("/ws", get(connect))
+        .route_layer(from_fn_with_state(app_state.clone(), require_token));
+    // The files of the page contain no data.
     for file in FILES {
         router = router.route(file.path, get(move |headers: HeaderMap| async move { file.response(&headers) }));
     }
-    router.layer(from_fn(reject_foreign_origins)).layer(from_fn(add_security_headers)).with_state(app_state)
+    router
+        .layer(from_fn_with_state(app_state.clone(), reject_foreign_origins))
+        .layer(from_fn(add_security_headers))
+        .with_state(app_state)
 }
 
 async fn status(State(app_state): State<AppState>) -> Response {
@@ -286,6 +346,7 @@ fn etag(bytes: &[u8]) -> String {
 async fn connect(
     upgrade: WebSocketUpgrade,
     Extension(connection): Extension<Arc<Connection>>,
+    Extension(role): Extension<Role>,
     State(app_state): State<AppState>,
 ) -> Response {
     if !app_state.admission.admit_client(&connection) {
@@ -293,7 +354,8 @@ async fn connect(
     }
     upgrade
         .max_message_size(MAX_MESSAGE_BYTES)
-        .on_upgrade(move |socket| session::serve(socket, connection, app_state.server_context))
+        .max_frame_size(MAX_MESSAGE_BYTES)
+        .on_upgrade(move |socket| session::serve(socket, connection, role, app_state.server_context))
 }
 
 /// Adds headers that keep other web sites from embedding or reading the responses.
@@ -310,54 +372,20 @@ async fn add_security_headers(request: Request, next: Next) -> Response {
     response
 }
 
-/// Allows only pages of this server: other web sites in the same browser can also reach loopback addresses.
-async fn reject_foreign_origins(request: Request, next: Next) -> Response {
-    if is_same_origin(request.headers()) {
-        next.run(request).await
-    } else {
-        (StatusCode::FORBIDDEN, "only pages of this server, opened under localhost, may use it").into_response()
+async fn reject_foreign_origins(State(app_state): State<AppState>, request: Request, next: Next) -> Response {
+    match app_state.access.check_origin(request.headers()) {
+        Ok(()) => next.run(request).await,
+        Err(refusal) => (StatusCode::FORBIDDEN, refusal.to_string()).into_response(),
     }
 }
 
-fn is_same_origin(headers: &HeaderMap) -> bool {
-    let text = |name| headers.get(name).and_then(|value| value.to_str().ok());
-    let Some(host) = text(header::HOST) else { return false };
-    let name = host.rsplit_once(':').filter(|(_, port)| port.parse::<u16>().is_ok()).map_or(host, |(name, _)| name);
-    let address = name.trim_start_matches('[').trim_end_matches(']').parse::<IpAddr>();
-    let is_local = name.eq_ignore_ascii_case("localhost") || address.is_ok_and(|address| address.is_loopback());
-    let has_same_origin = match headers.get(header::ORIGIN) {
-        None => true, // Not a browser.
-        Some(_) => text(header::ORIGIN).and_then(|origin| origin.strip_prefix("http://")) == Some(host),
-    };
-    is_local && has_same_origin
-}
-
-#[cfg(test)]
-mod tests {
-    use super::is_same_origin;
-    use axum::http::{HeaderMap, HeaderValue, header};
-
-    #[test]
-    fn foreign_origins_and_hosts_are_rejected() {
-        let cases = [
-            ("127.0.0.1:7007", None, true),
-            ("localhost:8080", Some("http://localhost:8080"), true),
-            ("[::1]:7007", Some("http://[::1]:7007"), true),
-            ("127.0.0.1:7007", Some("http://example.com"), false),
-            ("127.0.0.1:7007", Some("http://127.0.0.1:9999"), false),
-            ("127.0.0.1:7007", Some("null"), false),
-            ("example.com:7007", Some("http://example.com:7007"), false),
-            ("example.com", None, false),
-            ("192.168.0.5:7007", None, false),
-        ];
-        for (host, origin, expected) in cases {
-            let mut headers = HeaderMap::new();
-            headers.insert(header::HOST, HeaderValue::from_static(host));
-            if let Some(origin) = origin {
-                headers.insert(header::ORIGIN, HeaderValue::from_static(origin));
-            }
-            assert_eq!(is_same_origin(&headers), expected, "{host} {origin:?}");
+/// Refuses requests without a token, and stores the role of the others.
+async fn require_token(State(app_state): State<AppState>, mut request: Request, next: Next) -> Response {
+    match app_state.access.role_of(request.headers()) {
+        Ok(role) => {
+            request.extensions_mut().insert(role);
+            next.run(request).await
         }
-        assert!(!is_same_origin(&HeaderMap::new()));
+        Err(refusal) => (StatusCode::UNAUTHORIZED, refusal.to_string()).into_response(),
     }
 }

@@ -1,5 +1,6 @@
 //! The messages from the server, as in `docs/reference/protocol.md`.
 
+use crate::access::Role;
 use crate::clock::ServerClock;
 use crate::pose::row_major;
 use crate::protocol::{DepthFormat, ProjectionMessage};
@@ -18,6 +19,7 @@ pub(crate) enum ServerMessage<'a> {
         capabilities: &'a [&'a str],
         server: &'a str,
         client: u64,
+        role: Role,
         max_size_px: [u32; 2],
         default_stages: &'a [f64],
         clock_millis: f64,

@@ -1,11 +1,12 @@
 //! The session of one client, from hello to goodbye: a reader and a writer that never wait for each other.
 
 use crate::Hub;
+use crate::access::Role;
 use crate::admission::Connection;
 use crate::hub::Demand;
 use crate::link_rate::LinkRate;
 use crate::negotiation::{Negotiated, negotiate};
-use crate::protocol::{ClientMessage, SubscribeMessage};
+use crate::protocol::{ClientMessage, ControlMessage, SubscribeMessage};
 use crate::queue::MAX_VIEWS;
 use crate::server_context::ServerContext;
 use crate::view_request::{InvalidRequest, ViewRequest};
@@ -22,21 +23,29 @@ use tokio::sync::{mpsc, watch};
 const MAX_REPLIES: usize = 64;
 
 /// Serves one client until either side disconnects.
-pub(crate) async fn serve(socket: WebSocket, connection: Arc<Connection>, server_context: ServerContext) {
+pub(crate) async fn serve(socket: WebSocket, connection: Arc<Connection>, role: Role, server_context: ServerContext) {
     let (client, wake) = server_context.hub.join();
     let client_guard = ClientGuard { hub: &server_context.hub, client };
-    log::info!("client {client} connected");
+    log::info!("client {client} connected as {}", role.name());
     let (sink, stream) = socket.split();
     let (replies, waiting_replies) = mpsc::channel(MAX_REPLIES);
     let (demand_sender, demand) = watch::channel(Demand::new(Instant::now()));
-    let reader =
-        Reader { stream, hub: &server_context.hub, client, connection: &connection, replies, demand: demand_sender };
+    let reader = Reader {
+        stream,
+        hub: &server_context.hub,
+        client,
+        role,
+        connection: &connection,
+        replies,
+        demand: demand_sender,
+    };
     let link = LinkRate::default();
     connection.set_send_buffer(link.buffer_bytes());
     let writer = Writer {
         sink,
         server_context: &server_context,
         client,
+        role,
         connection: &connection,
         negotiated: Negotiated::default(),
         link,
@@ -66,6 +75,7 @@ struct Reader<'a> {
     stream: SplitStream<WebSocket>,
     hub: &'a Hub,
     client: u64,
+    role: Role,
     connection: &'a Connection,
     replies: mpsc::Sender<Reply>,
     demand: watch::Sender<Demand>,
@@ -105,7 +115,11 @@ impl Reader<'_> {
     }
 
     fn answer(&self, text: &str) -> Result<Option<Reply>, InvalidRequest> {
-        Ok(match serde_json::from_str(text)? {
+        let message: ClientMessage = serde_json::from_str(text)?;
+        if self.role < message.required_role() {
+            return Err(InvalidRequest::NotOperator);
+        }
+        Ok(match message {
             ClientMessage::Hello(hello) => Some(match negotiate(&hello) {
                 Ok(agreement) => {
                     let has_keyframe_changes = agreement.negotiated.has_keyframe_changes;
@@ -128,8 +142,9 @@ impl Reader<'_> {
                 self.subscribe(message)?;
                 None
             }
-            ClientMessage::Control(message) => {
-                self.hub.control(message.action);
+            ClientMessage::Control(ControlMessage { action }) => {
+                log::info!("client {}: {action:?}", self.client);
+                self.hub.control(action);
                 None
             }
             ClientMessage::Ping(ping) => Some(Reply::Pong { t: ping.t }),

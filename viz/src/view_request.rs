@@ -26,6 +26,8 @@ const MAX_VIEW_BYTES: usize = 64;
 pub(crate) enum InvalidRequest {
     #[error("cannot parse the message: {0}")]
     Json(#[from] serde_json::Error),
+    #[error("this message requires the role operator, and you are connected as viewer")]
+    NotOperator,
     #[error(
         "{field} is not a rigid transform; expected 16 numbers, row major, with an orthonormal rotation and last row 0 0 0 1"
     )]

@@ -4,6 +4,7 @@
 //! parts and the kernel's buffer are so small that their transfer takes less than 100 ms. Everything else waits here,
 //! where newer data replaces older data.
 
+use crate::access::Role;
 use crate::admission::Connection;
 use crate::client_updates::{ClientUpdates, Next};
 use crate::compact_depth::Effort;
@@ -55,6 +56,7 @@ pub(crate) struct Writer<'a> {
     pub(crate) sink: SplitSink<WebSocket, Message>,
     pub(crate) server_context: &'a ServerContext,
     pub(crate) client: u64,
+    pub(crate) role: Role,
     pub(crate) connection: &'a Connection,
     pub(crate) negotiated: Negotiated,
     pub(crate) link: LinkRate,
@@ -117,7 +119,9 @@ impl Writer<'_> {
                 && let Some(outgoing) = self.server_context.hub.collect(self.client)
             {
                 match outgoing {
-                    Outgoing::Picture(rendered) => encoding = Some(encode(rendered, self.link.effort())),
+                    Outgoing::Picture(rendered) => {
+                        encoding = Some(encode(rendered, self.link.effort(self.connection.is_loopback())))
+                    }
                     Outgoing::Failed { id, view, reason } => {
                         let sent = self.send_error(Some(id), &view, &reason).await;
                         self.server_context.hub.release(self.client);
@@ -223,6 +227,7 @@ impl Writer<'_> {
             capabilities: &CAPABILITIES,
             server: concat!("fieldrig ", env!("CARGO_PKG_VERSION")),
             client: self.client,
+            role: self.role,
             max_size_px: [MAX_SIZE_PX; 2],
             default_stages: &DEFAULT_STAGES,
             clock_millis: self.server_context.clock.now_millis(),

@@ -442,7 +442,7 @@ fn used_port_and_public_address_are_rejected() {
     assert!(error.to_string().contains(&used_address.to_string()), "{error}");
     let public: SocketAddr = "0.0.0.0:0".parse().expect("an address");
     let error = Server::start(ServerConfig { listen: public }, Hub::new()).expect_err("public");
-    assert!(matches!(error, Error::NotLoopback { .. }) && error.to_string().contains("TLS"), "{error}");
+    assert!(matches!(error, Error::NotLoopback { .. }) && error.to_string().contains("--share"), "{error}");
 }
 
 #[test]

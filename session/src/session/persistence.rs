@@ -72,10 +72,10 @@ impl Persistence {
         Ok(())
     }
 
-    /// Logs that growth was ended.
-    pub(super) fn log_growth_end(&mut self, method: &mut dyn Method) -> crate::Result<()> {
+    /// Logs that growth was paused or continued.
+    pub(super) fn log_growth_pause(&mut self, method: &mut dyn Method, is_paused: bool) -> crate::Result<()> {
         if let Some(decisions) = &mut self.decisions {
-            decisions.growth_ended(method.n_total_steps()?);
+            decisions.growth_paused(method.n_total_steps()?, is_paused);
         }
         Ok(())
     }

@@ -188,7 +188,7 @@ impl Args {
         if let Some(change) = change {
             running.live.change_keyframes(change);
         }
-        let address = running.server.address();
+        let address = running.page.address();
         let period = self.picture_rate.map_or(Duration::ZERO, |rate_hz| Duration::from_secs_f64(1.0 / rate_hz));
         let options = ViewerOptions { size_px: self.size, is_panorama: self.panorama, period };
         let viewers: Vec<Viewer> =

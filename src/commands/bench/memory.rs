@@ -74,7 +74,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Exit> {
 /// Returns the measurements of a run, and the device error that ended it early, if any.
 fn measure(args: &Args, flags: &run::Args) -> anyhow::Result<(MemoryRun, Option<drivers::Error>)> {
     let mut running = run::start(flags, None, &mut CreatedFolders::default())?;
-    let address = running.server.address();
+    let address = running.page.address();
     let viewers: Vec<Viewer> =
         (0..args.viewers).map(|_| Viewer::connect(address, ViewerOptions::default())).collect::<bench::Result<_>>()?;
     let every = Duration::from_secs_f64(args.every_secs);

@@ -42,7 +42,7 @@ impl Browser {
         script: &str,
     ) -> Self {
         let mut process = Command::new(program)
-            .args(["--headless", "--no-sandbox", "--disable-quic", "--no-first-run"])
+            .args(["--headless", "--no-sandbox", "--disable-quic", "--no-first-run", "--ignore-certificate-errors"])
             .args(["--disable-background-networking", "--disable-component-update", "--disable-sync"])
             .args(["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--hide-scrollbars"])
             .args(["--remote-debugging-port=0", "--force-device-scale-factor=1"])
@@ -142,7 +142,7 @@ impl Browser {
             let mut message: Value = serde_json::from_str(&text).expect("JSON");
             match message["method"].as_str() {
                 Some("Tracing.dataCollected") => {
-                    events.extend(message["params"]["value"].as_array_mut().expect("events").drain(..));
+                    events.append(message["params"]["value"].as_array_mut().expect("events"));
                 }
                 Some("Tracing.tracingComplete") => break,
                 _ => {}

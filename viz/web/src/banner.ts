@@ -27,7 +27,7 @@ export class Banner {
   }
 
   private show(): void {
-    const isBroken = this.connection === "silent" || this.connection === "lost";
+    const isBroken = ["silent", "lost", "refused"].includes(this.connection);
     // Once a run has ended, a stopped server is expected.
     const { result, isFinished } = this;
     const text = result ? runResultText(result) : isBroken ? capitalized(this.connectionText) : "";

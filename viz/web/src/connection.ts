@@ -1,5 +1,6 @@
 // The WebSocket: opens it, detects silence, reconnects after a failure, and forwards messages.
 
+import { refusalReason } from "./access";
 import { agree } from "./negotiation";
 import { PartJoiner } from "./part_joiner";
 import { type BinaryHeader, type Capability, type ClientMessage, type TextMessage, unframe } from "./protocol";
@@ -20,7 +21,7 @@ const LATE_MILLIS = 400;
 /** If a check is this late, the page or the computer was suspended. */
 const SUSPENDED_MILLIS = 5000;
 
-export type ConnectionState = "connecting" | "open" | "silent" | "lost";
+export type ConnectionState = "connecting" | "open" | "silent" | "lost" | "refused";
 
 export interface ConnectionEvents {
   state(state: ConnectionState, text: string): void;
@@ -38,6 +39,9 @@ export class Connection {
   private capabilities: ReadonlySet<string> = new Set();
   private socket: WebSocket | null = null;
   private goodbye = "";
+  /** Whether the current socket has received a hello. */
+  private hasHello = false;
+  private refusal = "";
   private state: ConnectionState = "connecting";
   private receivedAt = performance.now();
   private pingedAt = -Infinity;
@@ -81,6 +85,7 @@ export class Connection {
       if (socket === this.socket) this.disconnect();
     };
     this.socket = socket;
+    this.hasHello = false;
     this.parts.forget();
     this.capabilities = new Set();
     this.receivedAt = performance.now();
@@ -100,6 +105,13 @@ export class Connection {
     }
     this.retryAt = now + RETRY_MILLIS[Math.min(this.nRetries, RETRY_MILLIS.length - 1)]!;
     this.nRetries += 1;
+    this.report();
+    if (!this.hasHello) void this.askForRefusal();
+  }
+
+  /** Finds out why no WebSocket could be opened, because browsers do not show a server's refusal. */
+  private async askForRefusal(): Promise<void> {
+    this.refusal = await refusalReason();
     this.report();
   }
 
@@ -136,6 +148,10 @@ export class Connection {
         this.events.state("silent", `no data from the server for ${seconds(this.receivedAt)}`);
         break;
       case "lost": {
+        if (this.refusal) {
+          this.events.state("refused", this.refusal);
+          break;
+        }
         const why = this.goodbye || "connection lost";
         this.events.state("lost", `${why}, reconnecting for ${seconds(this.lostAt)}`);
         break;
@@ -160,6 +176,8 @@ export class Connection {
     switch (message.type) {
       case "hello": {
         this.goodbye = "";
+        this.refusal = "";
+        this.hasHello = true;
         const agreement = agree(message);
         if (typeof agreement === "string") {
           this.goodbye = agreement;

@@ -1,5 +1,6 @@
 // The operator's page: connects the connection, the view and the readouts.
 
+import { keepToken, showRole } from "./access";
 import { Banner } from "./banner";
 import { Connection } from "./connection";
 import { element } from "./element";
@@ -26,7 +27,9 @@ let liveCamera: LiveImageHeader | null = null;
 const readouts = new Readouts();
 const banner = new Banner();
 const view = new OrbitView(element("canvas", HTMLCanvasElement), () => scheduler.moved());
-const connection = new Connection(`ws://${location.host}/ws`, {
+keepToken();
+window.addEventListener("hashchange", keepToken);
+const connection = new Connection(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/ws`, {
   state(state, text) {
     const shown = element("connection");
     const before = shown.dataset.state;
@@ -70,6 +73,7 @@ function receiveText(message: TextMessage): void {
   switch (message.type) {
     case "hello":
       stages = message.default_stages;
+      showRole(message.role);
       break;
     case "status":
       latestStatus = message;

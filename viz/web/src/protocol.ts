@@ -26,6 +26,9 @@ export interface Pinhole {
   principal_px: [number, number];
 }
 
+/** What the page may do; only operators can change the run. */
+export type Role = "viewer" | "operator";
+
 export interface Hello {
   type: "hello";
   protocol: number;
@@ -34,6 +37,8 @@ export interface Hello {
   capabilities?: string[];
   server: string;
   client: number;
+  /** Servers before the capability `control` have none. */
+  role: Role | undefined;
   max_size_px: [number, number];
   default_stages: number[];
   clock_millis: number;

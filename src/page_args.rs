@@ -1,0 +1,119 @@
+//! Flags for the address of the page, and who may open it.
+
+use crate::exit::BadArgument;
+use crate::served_page::{ServedPage, Shared};
+use anyhow::Context;
+use session::next_commands::quoted;
+use std::net::{Ipv4Addr, SocketAddr};
+use std::path::PathBuf;
+use viz::{Certificate, Hub, Server, ServerConfig, Sharing, Tokens};
+
+/// Where the page is served, and to whom.
+#[derive(Clone, Debug, clap::Args)]
+pub(crate) struct PageArgs {
+    /// Address of the page: numeric IP address and port [default: 127.0.0.1:7007, with --share 0.0.0.0:7007; `view`
+    /// takes a free port if that one is in use]
+    #[arg(long, value_name = "ADDRESS", value_parser = address)]
+    listen: Option<SocketAddr>,
+    /// Let other machines open the page: encrypted, and only with a token, which is part of the printed addresses
+    #[arg(long)]
+    share: bool,
+    /// TLS certificate for --share, with its chain (PEM) [default: self-signed, kept for later runs]
+    #[arg(long, value_name = "FILE", requires = "share")]
+    certificate: Option<PathBuf>,
+    /// Private key of --certificate (PEM) [default: it is in the same file]
+    #[arg(long, value_name = "FILE", requires = "certificate")]
+    certificate_key: Option<PathBuf>,
+    /// Also serve images, joint states, frames, keyframes and metrics to Foxglove at this loopback address
+    #[arg(long, value_name = "ADDRESS", num_args = 0..=1, require_equals = true,
+        default_missing_value = "127.0.0.1:8765", value_parser = address)]
+    foxglove: Option<SocketAddr>,
+}
+
+/// Parses the address of the page.
+fn address(text: &str) -> Result<SocketAddr, String> {
+    text.parse().map_err(|_| "expected an address and a port, such as 127.0.0.1:7007".to_owned())
+}
+
+impl PageArgs {
+    /// Rejects an address that other machines can reach, unless the page is shared, and flags that this build lacks.
+    pub(crate) fn check(&self) -> Result<(), BadArgument> {
+        match self.listen {
+            Some(address) if !address.ip().is_loopback() && !self.share => {
+                let command: Vec<String> = std::env::args().skip(1).map(|word| quoted(&word)).collect();
+                Err(BadArgument(format!(
+                    "other machines can reach {address}, so the page must be encrypted and require a token: run \
+                     `fieldrig {} --share`",
+                    command.join(" ")
+                )))
+            }
+            _ if self.foxglove.is_some() && !cfg!(feature = "foxglove") => Err(BadArgument(
+                "--foxglove: this program was built without Foxglove support: build with `--features foxglove`"
+                    .to_owned(),
+            )),
+            _ => Ok(()),
+        }
+    }
+
+    /// Serves the page.
+    pub(crate) fn serve(&self, hub: &Hub) -> anyhow::Result<ServedPage> {
+        self.serve_at(self.listen.unwrap_or_else(|| self.default_address()), hub)
+    }
+
+    /// Serves the page; if the default address is in use, at a free port.
+    pub(crate) fn serve_or_free_port(&self, hub: &Hub) -> anyhow::Result<ServedPage> {
+        let served = self.serve(hub);
+        match served.as_ref().map_err(|error| error.downcast_ref()) {
+            Err(Some(viz::Error::AddressInUse { address })) if self.listen.is_none() => {
+                log::info!("{address} is in use by another program; using a free port");
+                self.serve_at(SocketAddr::new(address.ip(), 0), hub)
+            }
+            _ => served,
+        }
+    }
+
+    fn default_address(&self) -> SocketAddr {
+        let ServerConfig { mut listen } = ServerConfig::default();
+        if self.share {
+            listen.set_ip(Ipv4Addr::UNSPECIFIED.into());
+        }
+        listen
+    }
+
+    fn serve_at(&self, listen: SocketAddr, hub: &Hub) -> anyhow::Result<ServedPage> {
+        let config = ServerConfig { listen };
+        let (server, shared) = if self.share {
+            let (server, shared) = self.share_at(config, hub)?;
+            (server, Some(shared))
+        } else {
+            (Server::start(config, hub.clone())?, None)
+        };
+        Ok(ServedPage {
+            server,
+            shared,
+            #[cfg(feature = "foxglove")]
+            foxglove: self.foxglove.map(|address| viz::FoxgloveServer::start(address, hub.clone())).transpose()?,
+        })
+    }
+
+    fn share_at(&self, config: ServerConfig, hub: &Hub) -> anyhow::Result<(Server, Shared)> {
+        let certificate = match &self.certificate {
+            Some(file) => Certificate::read(file, self.certificate_key.as_ref().unwrap_or(file))?,
+            None => Certificate::kept_in(&data_folder()?)?,
+        };
+        let tokens = Tokens::random().context("cannot create a token")?;
+        let (fingerprint, is_self_signed) = (certificate.fingerprint(), self.certificate.is_none());
+        let server = Server::start_shared(config, Sharing { certificate, tokens: tokens.clone() }, hub.clone())?;
+        let shared = Shared::new(server.address(), &tokens, fingerprint, is_self_signed);
+        Ok((server, shared))
+    }
+}
+
+/// The user's folder for data of this program.
+fn data_folder() -> Result<PathBuf, BadArgument> {
+    let given = std::env::var_os("XDG_DATA_HOME").map(PathBuf::from).filter(|folder| folder.is_absolute());
+    let in_home = || Some(std::env::home_dir()?.join(".local/share"));
+    given.or_else(in_home).map(|folder| folder.join("fieldrig")).ok_or_else(|| {
+        BadArgument("there is no home folder for the TLS certificate: set HOME, or use --certificate".to_owned())
+    })
+}
