@@ -83,7 +83,7 @@ fn with(key: &'static str, value: &str) -> Result<Rig, ConfigError> {
 }
 
 /// Key, a valid value that differs from the current one, and an invalid value.
-const KEYS: [(&str, &str, &str); 181] = [
+const KEYS: [(&str, &str, &str); 182] = [
     ("arm.rate_hz", "500", "0"),
     ("arm.bus.can0.bitrate_hz", "500_000", "1"),
     ("arm.bus.can0.data_bitrate_hz", "5_000_000", "9_000_000"),
@@ -250,6 +250,7 @@ const KEYS: [(&str, &str, &str); 181] = [
     ("sim.speed", "0.5", "3"),
     ("sim.azimuth_only", "true", "1"),
     ("sim.duration_secs", "60", "0"),
+    ("sim.emulate_arm", "true", "1"),
     ("sim.n_images", "300", "0"),
     ("sim.truth", "false", "0"),
     ("sim.truth_depth", "true", "0"),
