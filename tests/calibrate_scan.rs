@@ -293,7 +293,7 @@ fn unusable_scans_are_rejected_with_the_reason() {
         (&["samples.json", "--with-joints"], "--urdf and --tip are needed"),
         (&["rig.toml", "--sim", "--target", TARGET, "--urdf", "a.urdf", "--tip", "b"], "names the robot description"),
         (&["rig.toml", "--sim", "--target", TARGET, "--camera", "front"], "it has wrist"),
-        (&["samples.json", "--sim", "--target", TARGET], "--sim and --seconds need a rig file"),
+        (&["samples.json", "--sim", "--target", TARGET], "--sim, --seconds and --listen need a rig file"),
         (&["rig.toml", "--sim", "--target", TARGET, "--rig", "rig.toml"], "is a rig file, which is used; remove --rig"),
         (&["rig.toml", "--sim", "--target", TARGET, "--write-rig", "absent/rig.toml"], "in an existing folder"),
         (&["samples.json", "--write-rig", "new.toml"], "name the one to change with --rig"),

@@ -447,7 +447,7 @@ impl Live {
             others: models.collect(),
             notes: [self.notes.clone(), self.device_notes.list(), movements.iter().map(ToString::to_string).collect()]
                 .concat(),
-            result: None,
+            ..Status::default()
         });
         Ok(())
     }

@@ -106,7 +106,7 @@ impl Args {
 }
 
 /// Starts the server at the given address; without one, at the default address or, if that is in use, at a free port.
-fn start_server(listen: Option<SocketAddr>, hub: &Hub) -> Result<Server, viz::Error> {
+pub(super) fn start_server(listen: Option<SocketAddr>, hub: &Hub) -> Result<Server, viz::Error> {
     let default_config = ServerConfig::default();
     match (listen, Server::start(listen.map_or(default_config, |listen| ServerConfig { listen }), hub.clone())) {
         (None, Err(viz::Error::AddressInUse { address })) => {

@@ -46,7 +46,7 @@ pub use hub::{Hub, PendingRender};
 pub use protocol::{BASE_PROTOCOL_VERSION, PROTOCOL_VERSION};
 pub use robot::{MeshFormat, RobotDescription, RobotMesh, RobotState};
 pub use server::{Server, ServerConfig};
-pub use updates::{KeyframePose, LiveImage, LivePixels, ModelStatus, RunResult, SceneHint, Status};
+pub use updates::{Guidance, KeyframePose, LiveImage, LivePixels, ModelStatus, RunResult, SceneHint, Status};
 
 /// Handles the messages of a client, one per line, and panics if a result is inconsistent.
 #[cfg(fuzzing)]

@@ -169,7 +169,7 @@ fn publish_updates(hub: &Hub) {
             ..ModelStatus::default()
         }],
         notes: Vec::new(),
-        result: None,
+        ..Status::default()
     });
 }
 

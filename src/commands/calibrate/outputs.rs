@@ -8,6 +8,7 @@ use kinematics::{Intrinsics, Transform};
 use session::calibration_report::{self, Heading};
 use session::{Data, DataOptions, corrected_rig};
 use std::path::{Path, PathBuf};
+use std::net::SocketAddr;
 
 /// Flags of commands that calibrate one camera, from files, a recording or the devices of a rig.
 #[derive(Debug, clap::Args)]
@@ -30,6 +31,10 @@ pub(super) struct RigFlags {
     #[arg(long, value_name = "S", value_parser = super::super::number_in_range(1.0..=3600.0))]
     pub(super) seconds: Option<f64>,
 }
+    /// With a rig file: loopback address of the page with the camera images and what to do next; port 0 uses any free port
+    /// [default: 127.0.0.1:7007 or, if that is in use, a free port]
+    #[arg(long, value_name = "ADDRESS")]
+    pub(super) listen: Option<SocketAddr>,
 
 /// What a command calibrates from.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -62,8 +67,8 @@ impl RigFlags {
     /// Rejects flags that do not apply to the input.
     pub(super) fn check(&self, input: &Path) -> Result<(), BadArgument> {
         let kind = InputKind::of(input);
-        let problem = if kind != InputKind::Rig && (self.sim || self.seconds.is_some()) {
-            "--sim and --seconds need a rig file (.toml) as input".to_owned()
+        let problem = if kind != InputKind::Rig && (self.sim || self.seconds.is_some() || self.listen.is_some()) {
+            "--sim, --seconds and --listen need a rig file (.toml) as input".to_owned()
         } else if kind == InputKind::Rig && self.rig.is_some() {
             format!("--rig: the input {} is a rig file, which is used; remove --rig", input.display())
         } else if kind != InputKind::Files {

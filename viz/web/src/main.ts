@@ -3,6 +3,7 @@
 import { Banner } from "./banner";
 import { Connection } from "./connection";
 import { element } from "./element";
+import { showGuidance } from "./guidance";
 import { setUpHelp } from "./help";
 import { KeyframeList } from "./keyframe_list";
 import { LinkReadout } from "./link_readout";
@@ -69,6 +70,7 @@ function receiveText(message: TextMessage): void {
       models.list(message);
       showStatus(message);
       banner.setRunResult(message.result);
+      showGuidance(message.guidance, banner, subscriptions);
       break;
     case "scene":
       view.setScene(message);

@@ -15,6 +15,8 @@ const HIDDEN_STATUS_HZ = 0.5;
 /** Limits of the height of camera images, in CSS pixels: see `.live canvas` in app.css. */
 const IMAGE_HEIGHT = { min: 90, max: 190, ofWindow: 0.22 };
 const MAX_IMAGE_WIDTH_PX = 640;
+/** Limits of images that fill the view. */
+const LARGE_IMAGE_PX: [number, number] = [1280, 960];
 /** The server rounds image sizes down to multiples of this. */
 const IMAGE_STEP_PX = 16;
 /** While the window is being resized, image sizes are not sent. */
@@ -25,6 +27,7 @@ export class Subscriptions {
   private readonly sent = new Map<SubscribeMessage["topic"], string>();
   private resizeTimer = 0;
   private showsPoints = false;
+  private showsLargeImages = false;
 
   constructor(private readonly connection: Connection) {
     document.addEventListener("visibilitychange", () => this.update());
@@ -43,6 +46,12 @@ export class Subscriptions {
   /** Whether the points of keyframes are shown. */
   set points(shown: boolean) {
     this.showsPoints = shown;
+    this.update();
+  }
+
+  /** Whether the camera images fill the view. */
+  set largeImages(shown: boolean) {
+    this.showsLargeImages = shown;
     this.update();
   }
 
@@ -66,7 +75,9 @@ export class Subscriptions {
         type: "subscribe",
         topic: "live_images",
         rate_hz: IMAGES_HZ,
-        size_px: [MAX_IMAGE_WIDTH_PX, IMAGE_STEP_PX * Math.ceil(height / IMAGE_STEP_PX)],
+        size_px: this.showsLargeImages
+          ? LARGE_IMAGE_PX
+          : [MAX_IMAGE_WIDTH_PX, IMAGE_STEP_PX * Math.ceil(height / IMAGE_STEP_PX)],
       },
     ];
     if (this.connection.supports("robot")) {
