@@ -5,10 +5,11 @@ use calibration::hand_eye::{JointOffset, Setup};
 use capture::config::{Camera, Parent, Rig};
 use keyframe::listed;
 use kinematics::{Intrinsics, Transform};
+use nalgebra::DMatrix;
 use session::calibration_report::{self, Heading};
 use session::{Data, DataOptions, corrected_rig};
-use std::path::{Path, PathBuf};
 use std::net::SocketAddr;
+use std::path::{Path, PathBuf};
 
 /// Flags of commands that calibrate one camera, from files, a recording or the devices of a rig.
 #[derive(Debug, clap::Args)]
@@ -30,11 +31,11 @@ pub(super) struct RigFlags {
     /// With a rig file: read the devices for S seconds [default: 30]
     #[arg(long, value_name = "S", value_parser = super::super::number_in_range(1.0..=3600.0))]
     pub(super) seconds: Option<f64>,
-}
     /// With a rig file: loopback address of the page with the camera images and what to do next; port 0 uses any free port
     /// [default: 127.0.0.1:7007 or, if that is in use, a free port]
     #[arg(long, value_name = "ADDRESS")]
     pub(super) listen: Option<SocketAddr>,
+}
 
 /// What a command calibrates from.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -149,8 +150,12 @@ impl RigOutput {
         Ok(corrected_rig::expect_size(corrected_rig::camera(&self.rig, &self.camera)?, size_px)?)
     }
 
-    pub(super) fn set_intrinsics(&mut self, intrinsics: &Intrinsics) -> anyhow::Result<()> {
-        self.rig = corrected_rig::with_intrinsics(&self.rig, &self.camera, intrinsics)?;
+    pub(super) fn set_intrinsics(
+        &mut self,
+        intrinsics: &Intrinsics,
+        covariance: Option<&DMatrix<f64>>,
+    ) -> anyhow::Result<()> {
+        self.rig = corrected_rig::with_intrinsics(&self.rig, &self.camera, intrinsics, covariance)?;
         Ok(())
     }
 

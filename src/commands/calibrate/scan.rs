@@ -3,9 +3,10 @@
 
 use super::guide::{Guide, Purpose};
 use super::images::{self, DetectedImage, OtherSize};
+use super::lens::covariance_of;
 use super::outputs::{InputKind, RigFlags, RigOutput};
-use crate::exit::{BadArgument, InsufficientData};
 use super::page::GuidancePage;
+use crate::exit::{BadArgument, InsufficientData};
 use crate::{print, signals};
 use calibration::BoardView;
 use calibration::hand_eye::{BoardObservation, FlangeMotion, HandEyeSample, Setup, corners_at_mid_exposure};
@@ -14,11 +15,12 @@ use capture::open::{self, Devices, Opened};
 use capture::{ArmDuringImage, CalibrationImage, CalibrationImages, calibration_images};
 use drivers::Sample;
 use kinematics::{Chain, Intrinsics, Stamp, Transform};
+use nalgebra::DMatrix;
 use session::calibration_report::{Photo, Photos, Unused};
 use session::corrected_rig;
+use std::ops::ControlFlow;
 use std::path::Path;
 use targets::TargetSpec;
-use std::ops::ControlFlow;
 
 /// Time for which devices are read if no flag limits it, seconds.
 const DEFAULT_SECS: f64 = 30.0;
@@ -225,6 +227,13 @@ impl Scan {
 
     pub(super) fn intrinsics(&self) -> &Intrinsics {
         &self.camera.intrinsics
+    }
+
+    /// Covariance of the intrinsics, if the rig file contains it.
+    pub(super) fn intrinsics_covariance(&self) -> Result<Option<DMatrix<f64>>, BadArgument> {
+        let Camera { name, intrinsics, intrinsics_covariance, .. } = &self.camera;
+        covariance_of(intrinsics_covariance, intrinsics)
+            .map_err(|error| BadArgument(format!("camera.{name}.intrinsics_covariance: {error}")))
     }
 
     /// The size of a board that the images show instead of that of the target.

@@ -335,6 +335,7 @@ impl Images<'_> {
             setup: self.setup(),
             samples: self.found.iter().filter_map(sample).collect(),
             intrinsics: Some(self.camera.intrinsics.clone()),
+            intrinsics_covariance: None, // Further poses do not lower its effect.
             board_symmetries: symmetries,
             chain: Some(chain),
             options: ArmPlan::estimate_options(&self.request.options),
