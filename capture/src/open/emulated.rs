@@ -1,14 +1,13 @@
 //! Opens simulated cameras on an arm whose driver is not simulated: it connects to an emulated controller, whose motors
 //! move the simulated arm in real time.
 
-use super::movable::Movable;
 use super::real;
 use super::simulated::unlimited;
 use crate::config::{ArmDriver, Rig};
 use drivers::franka::FciVersion;
 use drivers::franka::emulated::{EmulatedRobot, Limits, RobotConfig};
 use drivers::motion::{JointTarget, Motion, MovableArm};
-use drivers::{Arm, Error, clock};
+use drivers::{Arm, Camera, Error, clock};
 use keyframe::bail;
 use kinematics::{JointState, Transform};
 use sim::MotorHistory;
@@ -16,17 +15,18 @@ use sim::wire::{JointTrack, emulate_fci};
 use std::net::{Ipv4Addr, SocketAddr};
 use std::time::Duration;
 
-pub(super) fn movable(mut rig: Rig) -> crate::Result<Movable> {
+/// Opens the camera, and the arm for motion. The address of the arm becomes that of the controller.
+pub(super) fn open(rig: &mut Rig) -> crate::Result<(Box<dyn MovableArm>, Box<dyn Camera>)> {
     if rig.arm.driver != ArmDriver::Franka {
         bail!("sim.emulate_arm: only a controller of the driver \"franka\" can be emulated for a simulated camera");
     }
-    let mut simulated = sim::open(&unlimited(&rig)?)?;
+    let mut simulated = sim::open(&unlimited(rig)?)?;
     let motors = MotorHistory::default();
     let config = RobotConfig {
         address: SocketAddr::from((Ipv4Addr::LOCALHOST, 0)),
         // That of the Panda in the simulated scenes.
         version: FciVersion::V5,
-        chain: real::franka_chain(&rig)?,
+        chain: real::franka_chain(rig)?,
         flange_from_tool: Transform::identity(),
         limits: Limits::panda(),
     };
@@ -37,8 +37,8 @@ pub(super) fn movable(mut rig: Rig) -> crate::Result<Movable> {
     let Some(camera) = simulated.into_motorized(motors, clock::now())?.into_iter().next() else {
         bail!("the simulated rig has no camera");
     };
-    let arm = Box::new(EmulatedArm { arm: real::movable_arm(&rig)?, _controller: controller });
-    Ok(Movable { rig, arm, camera })
+    let arm = Box::new(EmulatedArm { arm: real::movable_arm(rig)?, _controller: controller });
+    Ok((arm, camera))
 }
 
 /// A driver with the emulated controller that it is connected to.

@@ -77,8 +77,9 @@ fn simulated(rig: Rig) -> crate::Result<Movable> {
 }
 
 #[cfg(all(feature = "sim", target_os = "linux"))]
-fn emulated(rig: Rig) -> crate::Result<Movable> {
-    super::emulated::movable(rig)
+fn emulated(mut rig: Rig) -> crate::Result<Movable> {
+    let (arm, camera) = super::emulated::open(&mut rig)?;
+    Ok(Movable { rig, arm, camera })
 }
 
 #[cfg(not(all(feature = "sim", target_os = "linux")))]
