@@ -12,7 +12,7 @@ use viz::{Certificate, Hub, Server, ServerConfig, Sharing, Tokens};
 #[derive(Clone, Debug, clap::Args)]
 pub(crate) struct PageArgs {
     /// Address of the page: numeric IP address and port [default: 127.0.0.1:7007, with --share 0.0.0.0:7007; `view`
-    /// takes a free port if that one is in use]
+    /// and `calibrate` take a free port if that one is in use]
     #[arg(long, value_name = "ADDRESS", value_parser = address)]
     listen: Option<SocketAddr>,
     /// Let other machines open the page: encrypted, and only with a token, which is part of the printed addresses
@@ -36,6 +36,11 @@ fn address(text: &str) -> Result<SocketAddr, String> {
 }
 
 impl PageArgs {
+    /// Whether any of the flags is given.
+    pub(crate) fn is_given(&self) -> bool {
+        self.listen.is_some() || self.share || self.foxglove.is_some()
+    }
+
     /// Rejects an address that other machines can reach, unless the page is shared, and flags that this build lacks.
     pub(crate) fn check(&self) -> Result<(), BadArgument> {
         match self.listen {

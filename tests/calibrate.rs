@@ -441,3 +441,38 @@ fn rig_is_calibrated_from_a_simulated_scan() {
     let written = std::fs::read_to_string(folder.path().join("calibrated.toml")).expect("a rig file");
     assert!(written.contains("[camera.wrist.sim.truth") && !written.contains("lockstep = true"), "{written}");
 }
+
+/// The disk is full, here a limit of the file size.
+#[cfg(unix)]
+#[test]
+fn result_is_printed_if_the_report_cannot_be_written() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let pairs = robot_poses().into_iter().zip(board_poses());
+    let sample = |(robot, board): (Transform, Transform)| json!({"base_from_flange": rows(&robot), "camera_from_board": rows(&board)});
+    let samples: Vec<Value> = pairs.map(sample).collect();
+    for (name, samples) in [("good.json", &samples[..]), ("few.json", &samples[..2])] {
+        std::fs::write(folder.path().join(name), json!({"samples": samples}).to_string()).expect("a file");
+    }
+    let run = |input: &str| {
+        let limited = "trap '' XFSZ; ulimit -f 1; exec \"$0\" \"$@\"";
+        std::process::Command::new("sh")
+            .args(["-c", limited, env!("CARGO_BIN_EXE_fieldrig"), "calibrate", "hand-eye", input])
+            .args(["--json", "--report", "page.html"])
+            .current_dir(folder.path())
+            .output()
+            .expect("sh starts")
+    };
+    let output = run("good.json");
+    let problem = stderr(&output);
+    assert_eq!(output.status.code(), Some(1), "{problem}");
+    assert!(json_of(&output)["flange_from_camera"].is_array(), "{problem}");
+    assert_eq!(problem.lines().filter(|line| line.contains("page.html")).count(), 1, "{problem}");
+    // A refusal keeps its reason and its exit code.
+    let output = run("few.json");
+    let problem = stderr(&output);
+    assert_eq!(output.status.code(), Some(INSUFFICIENT_DATA), "{problem}");
+    assert!(json_of(&output)["refused"].is_string() && problem.contains("page.html"), "{problem}");
+    let left: Vec<_> =
+        std::fs::read_dir(folder.path()).expect("a folder").flatten().map(|file| file.file_name()).collect();
+    assert_eq!(left.len(), 2, "no part of a report is left: {left:?}");
+}

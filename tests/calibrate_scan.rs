@@ -161,6 +161,80 @@ fn joint_offsets_are_estimated_and_written() {
     assert_eq!(rig["arm"]["joint_offsets"][0].as_float(), Some(0.0));
 }
 
+/// The production driver moves an emulated controller, whose motors move the simulated arm and camera in real time. Only the
+/// images and the motors are simulated.
+#[cfg(target_os = "linux")]
+mod emulated_controller {
+    use super::{MAX_DEG_WITH_LENS, TARGET, check_pose, fieldrig, json_of, stderr, write_rig};
+    use std::io::{BufRead, BufReader, Read};
+    use std::path::Path;
+    use std::process::{Command, Stdio};
+    use std::time::Duration;
+
+    /// The emulated controller stops the arm if the computer is too busy to answer in time, as a real one does.
+    const BUSY: &str = "communication_constraints_violation";
+    const MAX_ATTEMPTS: usize = 3;
+    const ARGS: [&str; 8] =
+        ["calibrate", "hand-eye", "rig.toml", "--sim", "--move", "--target", TARGET, "--with-intrinsics"];
+
+    fn write_emulated_rig(folder: &Path, rate_hz: f64) {
+        write_rig(folder, "rig.toml", |rig| {
+            let motion = toml::Table::from_iter([("on_loss".to_owned(), "hold".into())]);
+            let arm = rig["arm"].as_table_mut().expect("a table");
+            arm.insert("motion".to_owned(), motion.into());
+            arm["driver"] = "franka".into();
+            rig["camera"]["wrist"]["rate_hz"] = rate_hz.into();
+            rig["sim"].as_table_mut().expect("a table").insert("emulate_arm".to_owned(), true.into());
+        });
+    }
+
+    #[test]
+    fn arm_moves_until_its_camera_is_calibrated() {
+        let folder = tempfile::tempdir().expect("a folder");
+        write_emulated_rig(folder.path(), 2.0);
+        let output = (1..=MAX_ATTEMPTS).find_map(|attempt| {
+            let output = fieldrig(folder.path(), &[&ARGS[..], &["--goal-mm", "0.3", "--json"]].concat());
+            let is_retried = attempt < MAX_ATTEMPTS && stderr(&output).contains(BUSY);
+            (!is_retried).then_some(output)
+        });
+        let output = output.expect("the last attempt counts");
+        let log = stderr(&output);
+        assert!(output.status.success(), "{log}");
+        assert!(log.contains("an emulated Franka controller") && log.contains("returning to the start"), "{log}");
+        check_pose(&json_of(&output), MAX_DEG_WITH_LENS);
+    }
+
+    #[test]
+    fn ctrl_c_while_the_arm_waits_for_an_image_ends_the_motion() {
+        let folder = tempfile::tempdir().expect("a folder");
+        // The motion to a pose takes three seconds, and its image comes eight seconds after that of the pose before.
+        write_emulated_rig(folder.path(), 0.125);
+        let mut child = Command::new(env!("CARGO_BIN_EXE_fieldrig"))
+            .current_dir(folder.path())
+            .args(ARGS)
+            .stdout(Stdio::null())
+            .stderr(Stdio::piped())
+            .spawn()
+            .expect("it is built");
+        let mut log = BufReader::new(child.stderr.take().expect("piped"));
+        let mut text = String::new();
+        while !text.contains("moving to pose 3") {
+            assert!(log.read_line(&mut text).expect("text") > 0, "it ended early: {text}");
+        }
+        std::thread::sleep(Duration::from_secs(5));
+        let interrupt = Command::new("kill").args(["-INT", &child.id().to_string()]).status();
+        assert!(interrupt.expect("kill runs").success());
+        log.read_to_string(&mut text).expect("text");
+        child.wait().expect("our own child");
+        // Two images do not determine the pose of the camera.
+        assert!(
+            text.contains("stopping the arm, then calibrating") && text.contains("at least 3 are needed"),
+            "{text}"
+        );
+        assert!(!text.contains("] pose 3: ") && !text.contains("returning to the start"), "{text}");
+    }
+}
+
 /// Ctrl-C stops the arm; the images so far are used.
 #[cfg(unix)]
 #[test]
@@ -219,7 +293,10 @@ fn unusable_scans_are_rejected_with_the_reason() {
         (&["samples.json", "--with-joints"], "--urdf and --tip are needed"),
         (&["rig.toml", "--sim", "--target", TARGET, "--urdf", "a.urdf", "--tip", "b"], "names the robot description"),
         (&["rig.toml", "--sim", "--target", TARGET, "--camera", "front"], "it has wrist"),
-        (&["samples.json", "--sim", "--target", TARGET], "--sim and --seconds need a rig file"),
+        (
+            &["samples.json", "--sim", "--target", TARGET],
+            "--sim, --seconds and the flags of the page (--listen, --share) need a rig file",
+        ),
         (&["rig.toml", "--sim", "--target", TARGET, "--rig", "rig.toml"], "is a rig file, which is used; remove --rig"),
         (&["rig.toml", "--sim", "--target", TARGET, "--write-rig", "absent/rig.toml"], "in an existing folder"),
         (&["samples.json", "--write-rig", "new.toml"], "name the one to change with --rig"),

@@ -13,6 +13,7 @@ use image::{DynamicImage, RgbImage};
 use keyframe::bail;
 use kinematics::{Chain, HistoryError, JointHistory, JointState, Stamp, Transform, transform};
 use std::collections::VecDeque;
+use std::ops::ControlFlow;
 use std::time::Duration;
 
 /// Maximum number of joint readings kept: those of 20 s at 1 kHz.
@@ -73,11 +74,11 @@ pub struct CalibrationImages {
     pub damage: Option<String>,
 }
 
-/// Reads the images of a camera until `is_end` returns true or the samples end.
+/// Reads the images of a camera until `on_sample` breaks or the samples end.
 ///
 /// * `max_shift_px`: maximum predicted image motion over readout, exposure and stamp uncertainty, for a scene at
 ///   `join.default_depth_m`. Images with more motion are not kept.
-/// * `on_sample`: is called after each sample, with the images kept so far.
+/// * `on_sample`: is called with each sample before it is used, and with the images kept so far.
 ///
 /// # Errors
 ///
@@ -86,17 +87,15 @@ pub fn calibration_images(
     opened: Opened,
     camera: &str,
     max_shift_px: f64,
-    mut is_end: impl FnMut(&Sample) -> bool,
-    on_sample: &mut dyn FnMut(&[CalibrationImage]),
+    mut on_sample: impl FnMut(&Sample, &[CalibrationImage]) -> ControlFlow<()>,
 ) -> crate::Result<CalibrationImages> {
     let Opened { rig, mut source, damage, .. } = opened;
     let mut reader = Reader::new(&rig, camera, max_shift_px)?;
     while let Some(sample) = source.next_sample()? {
-        if is_end(&sample) {
+        if on_sample(&sample, &reader.found.images).is_break() {
             break;
         }
         reader.push(sample);
-        on_sample(&reader.found.images);
     }
     reader.found.n_unusable += reader.waiting.len();
     Ok(CalibrationImages { damage: damage.get().cloned(), ..reader.found })

@@ -1,7 +1,7 @@
-//! An arm that is blocked, sags or loses its connection while it moves.
+//! An arm that is blocked, sags or loses its connection while it moves, and a driver on an emulated controller.
 #![cfg(feature = "sim")]
 
-use capture::config::Rig;
+use capture::config::{Override, Rig};
 use capture::open::{self, Devices};
 use capture::{ArmCapture, Stop};
 use drivers::motion::{JointTarget, Motion, MovableArm};
@@ -157,4 +157,119 @@ fn arm_that_reports_nothing_is_stopped() {
     let error = capture.move_to(&rotated(&start, 0.2), &Stop::default()).expect_err("it is silent");
     assert!(format!("{error:#}").contains("no joint"), "{error:#}");
     assert_eq!(log.lock().n_stops, 1);
+}
+
+/// The production driver of a Franka arm, connected to an emulated controller whose motors move the simulated arm and its
+/// camera in real time.
+#[cfg(target_os = "linux")]
+mod emulated_controller {
+    use super::{ArmCapture, Devices, Override, Path, Rig, Stop, open, rotated};
+    use std::time::{Duration, Instant};
+
+    /// The emulated controller stops the arm if the computer is too busy to answer in time, as a real one does.
+    const BUSY: &str = "communication_constraints_violation";
+    const MAX_ATTEMPTS: usize = 3;
+
+    fn connected(rate_hz: f64) -> capture::Result<(ArmCapture, Vec<f64>)> {
+        let overrides = [
+            Override::new("arm.driver", "franka"),
+            Override::new("arm.motion.on_loss", "hold"),
+            Override::new("camera.wrist.rate_hz", rate_hz),
+            Override::new("sim.emulate_arm", true),
+        ];
+        let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("../rigs/calibration-board.toml");
+        let rig = Rig::load(&file, &overrides).expect("a bundled rig file");
+        let mut capture = ArmCapture::new(open::movable(&rig, Devices::Sim, "wrist")?)?;
+        let start = capture.joints()?;
+        Ok((capture, start))
+    }
+
+    /// Repeats a test that fails because the computer is busy.
+    fn unless_busy(test: impl Fn() -> capture::Result<()>) {
+        for attempt in 1..=MAX_ATTEMPTS {
+            match test() {
+                Ok(()) => return,
+                Err(error) => {
+                    let is_busy = format!("{error:#}").contains(BUSY);
+                    assert!(is_busy && attempt < MAX_ATTEMPTS, "attempt {attempt}: {error:#}");
+                }
+            }
+        }
+    }
+
+    /// The largest difference between two positions.
+    fn distance(a: &[f64], b: &[f64]) -> f64 {
+        a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max)
+    }
+
+    /// The joints after the states that have arrived, and how far they move within half a second.
+    fn joints_and_drift(capture: &mut ArmCapture) -> capture::Result<(Vec<f64>, f64)> {
+        let settled = Instant::now() + Duration::from_millis(200);
+        let mut joints = capture.joints()?;
+        while Instant::now() < settled {
+            joints = capture.joints()?;
+        }
+        let (end, mut drift) = (Instant::now() + Duration::from_millis(500), 0.0f64);
+        while Instant::now() < end {
+            drift = drift.max(distance(&capture.joints()?, &joints));
+        }
+        Ok((joints, drift))
+    }
+
+    fn requested_after(secs: f64) -> Stop {
+        let stop = Stop::default();
+        let later = stop.clone();
+        std::thread::spawn(move || {
+            std::thread::sleep(Duration::from_secs_f64(secs));
+            later.request();
+        });
+        stop
+    }
+
+    #[test]
+    fn poses_are_visited_and_photographed_at_rest() {
+        unless_busy(|| {
+            let (mut capture, start) = connected(2.0)?;
+            let mut last = None;
+            for angle in [0.0, 0.15, -0.2] {
+                let goal = rotated(&start, angle);
+                assert!(capture.move_to(&goal, &Stop::default())?);
+                let image = capture.image(&Stop::default())?.expect("no stop was requested");
+                let arm = image.arm.as_ref().expect("the arm is known");
+                assert!(distance(&arm.joints, &goal) < 1e-3, "{:?}, commanded {goal:?}", arm.joints);
+                let shows_motion = last.replace(image.gray.clone()).is_none_or(|last| last != image.gray);
+                assert!(shows_motion, "the camera moves with the motors");
+            }
+            Ok(())
+        });
+    }
+
+    #[test]
+    fn stop_while_waiting_for_an_image_leaves_the_arm_holding() {
+        unless_busy(|| {
+            // The next image is a minute away.
+            let (mut capture, start) = connected(0.01)?;
+            let goal = rotated(&start, 0.15);
+            assert!(capture.move_to(&goal, &Stop::default())?);
+            assert!(capture.image(&requested_after(1.0))?.is_none(), "it waits until the stop");
+            let (held, drift) = joints_and_drift(&mut capture)?;
+            assert!(distance(&held, &goal) < 1e-3 && drift < 1e-4, "{held:?} drifts by {drift}, commanded {goal:?}");
+            // It has not stopped because of a fault.
+            assert!(capture.move_to(&start, &Stop::default())?);
+            Ok(())
+        });
+    }
+
+    #[test]
+    fn stop_during_a_motion_brings_the_arm_to_rest() {
+        unless_busy(|| {
+            let (mut capture, start) = connected(2.0)?;
+            let goal = rotated(&start, 0.24);
+            assert!(!capture.move_to(&goal, &requested_after(0.4))?, "the stop was requested on the way");
+            let (rest, drift) = joints_and_drift(&mut capture)?;
+            assert!(drift < 1e-4, "{drift}");
+            assert!(distance(&rest, &start) > 1e-3 && distance(&rest, &goal) > 0.01, "{rest:?}");
+            Ok(())
+        });
+    }
 }

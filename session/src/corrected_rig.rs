@@ -6,7 +6,7 @@ use calibration::{Alignment, CameraCorrection, Estimate};
 use capture::config::{Base, Camera, Parent, Rig, TimeOffset};
 use keyframe::listed;
 use kinematics::{Chain, Intrinsics, Stamp, Transform};
-use nalgebra::{Translation3, UnitQuaternion, Vector3};
+use nalgebra::{DMatrix, Translation3, UnitQuaternion, Vector3};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
@@ -76,14 +76,23 @@ pub fn camera<'a>(rig: &'a Rig, name: &str) -> Result<&'a Camera, Error> {
 
 /// The rig with other intrinsics of a camera. Depth images with the same lens get them, too.
 ///
+/// * `covariance`: that of the intrinsics, if it is known.
+///
 /// # Errors
 /// [`Error::BadInput`] if there is no such camera, or if its images have another size.
-pub fn with_intrinsics(rig: &Rig, name: &str, intrinsics: &Intrinsics) -> Result<Rig, Error> {
+pub fn with_intrinsics(
+    rig: &Rig,
+    name: &str,
+    intrinsics: &Intrinsics,
+    covariance: Option<&DMatrix<f64>>,
+) -> Result<Rig, Error> {
     expect_size(camera(rig, name)?, intrinsics.size_px)?;
     let mut rig = rig.clone();
     for camera in rig.cameras.iter_mut().filter(|camera| *camera.name == *name) {
         let before = std::mem::replace(&mut camera.intrinsics, intrinsics.clone());
         camera.realsense.unknown.intrinsics = false;
+        // Symmetric, so the order of rows and columns does not matter.
+        camera.intrinsics_covariance = covariance.map_or_else(Vec::new, |covariance| covariance.as_slice().to_vec());
         if let Some(depth) = &mut camera.depth
             && depth.intrinsics == before.resized(depth.intrinsics.size_px)
         {
@@ -237,6 +246,9 @@ fn correct(camera: &mut Camera, correction: &CameraCorrection, estimates: &[Esti
         depth.factor *= correction.log_depth_scale.exp();
     }
     correct_lens(&mut camera.intrinsics);
+    if (correction.log_focal, correction.principal_offset_focals) != ([0.0; 2], [0.0; 2]) {
+        camera.intrinsics_covariance.clear();
+    }
 }
 
 #[cfg(test)]
@@ -322,8 +334,12 @@ mod tests {
         let rig = bundled_rig();
         let before = &rig.cameras[0];
         let other = Intrinsics { focal_px: [700.0, 701.0], ..before.intrinsics.clone() };
-        let replaced = with_intrinsics(&rig, "wrist", &other).unwrap();
+        let covariance = DMatrix::from_diagonal_element(4, 4, 0.25);
+        let replaced = with_intrinsics(&rig, "wrist", &other, Some(&covariance)).unwrap();
         assert_eq!(replaced.cameras[0].intrinsics, other);
+        assert_eq!(replaced.cameras[0].intrinsics_covariance, covariance.as_slice());
+        let again = with_intrinsics(&replaced, "wrist", &before.intrinsics, None).unwrap();
+        assert!(again.cameras[0].intrinsics_covariance.is_empty(), "it was that of other intrinsics");
         let depth = replaced.cameras[0].depth.as_ref().unwrap();
         assert_eq!(depth.intrinsics, other.resized(depth.intrinsics.size_px), "depth uses the same lens");
         let pose = Transform::translation(0.1, 0.2, 0.3);
@@ -332,10 +348,10 @@ mod tests {
         assert_eq!(moved.cameras[0].intrinsics, before.intrinsics);
 
         let message = |result: Result<Rig, Error>| result.unwrap_err().to_string();
-        let unknown = message(with_intrinsics(&rig, "wirst", &other));
+        let unknown = message(with_intrinsics(&rig, "wirst", &other, None));
         assert!(unknown.contains("wirst") && unknown.contains("wrist"), "{unknown}");
         let small = Intrinsics { size_px: [320, 240], ..other };
-        assert!(message(with_intrinsics(&rig, "wrist", &small)).contains("320x240"));
+        assert!(message(with_intrinsics(&rig, "wrist", &small, None)).contains("320x240"));
         let base = message(with_extrinsics(&rig, "wrist", Parent::Base, &pose));
         assert!(base.contains("is flange") && base.contains("the base"), "{base}");
     }

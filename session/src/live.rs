@@ -493,7 +493,7 @@ impl Live {
                 self.checkpoint_note.iter().cloned().collect(),
             ]
             .concat(),
-            result: None,
+            ..Status::default()
         });
         Ok(())
     }

@@ -6,6 +6,7 @@ use crate::cabinet_tour::light_frac;
 use crate::commands::Commands;
 use crate::config::{CameraConfig, Config, Parent, Scene, SensorConfig, StampConfig};
 use crate::lidar::{self, RayCaster};
+use crate::motors::{MotorHistory, MotorizedArm};
 use crate::noise;
 use crate::optics::{Optics, RowMotion};
 use crate::panda::Joints;
@@ -265,6 +266,15 @@ impl Engine {
         Ok(())
     }
 
+    /// Moves the arm by emulated motors instead of the scan. `start`: stamp of simulated time zero.
+    pub(crate) fn follow_motors(&mut self, motors: MotorHistory, start: Stamp) -> Result<(), Error> {
+        self.robot.arm_mut().ok_or(Error::NoArm)?;
+        let (joint_ixs, joint_offsets) = (self.joint_ixs.clone(), self.config.joint_offsets.clone());
+        self.robot.follow_motors(MotorizedArm { motors, start, joint_ixs, joint_offsets });
+        self.looks_ahead = false;
+        Ok(())
+    }
+
     /// Sets the stamp of simulated time zero. Call before taking the first sample.
     pub(crate) fn set_start(&mut self, start: Stamp) {
         self.start = start;
@@ -306,7 +316,7 @@ impl Engine {
 
     /// Moves the robot by one step and starts rendering the images that arrive by then.
     fn step(&mut self) -> Result<(), Error> {
-        let (nanos, reading) = self.robot.step();
+        let (nanos, reading) = self.robot.step()?;
         if self.config.duration_secs.is_some_and(|secs| nanos > nanos_from_secs(secs)) {
             self.has_ended = true;
             return Ok(());

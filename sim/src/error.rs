@@ -46,6 +46,9 @@ pub enum Error {
     /// The robot of the scene has no arm to move.
     #[error("the robot of this scene has no arm")]
     NoArm,
+    /// The emulated motors no longer report their positions.
+    #[error("the emulated motors of the simulated arm have stopped")]
+    MotorsStopped,
     /// The arm cannot be moved within the given limits.
     #[error("the simulated arm cannot be moved: {reason}")]
     Motion {

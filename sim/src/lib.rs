@@ -2,7 +2,7 @@
 //!
 //! [`open`] builds a rig. [`Rig::into_lockstep`] runs it as fast as the caller takes samples; the same seed gives
 //! bit-identical samples. [`Rig::into_live`] runs it in real time as devices. [`Rig::into_commanded`] gives an arm that
-//! moves by commands.
+//! moves by commands, [`Rig::into_motorized`] cameras on an arm that emulated motors move.
 //!
 //! ```no_run
 //! use sim::Config;
@@ -34,6 +34,7 @@ mod light;
 mod live;
 mod lockstep;
 mod mesh;
+mod motors;
 mod noise;
 mod objects;
 mod optics;
@@ -67,5 +68,6 @@ pub use config::{
 pub use error::Error;
 pub use live::{LiveRig, LiveTruth};
 pub use lockstep::Lockstep;
+pub use motors::MotorHistory;
 pub use rig::{PANDA_URDF, Rig, open};
 pub use rig_info::{CameraInfo, RigInfo};

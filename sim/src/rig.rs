@@ -9,11 +9,13 @@ use crate::engine::{Cameras, Engine, history_nanos};
 use crate::follower::{Follower, Tour};
 use crate::live::LiveRig;
 use crate::lockstep::Lockstep;
+use crate::motors::MotorHistory;
 use crate::render::Renderer;
 use crate::rig_info::{CameraInfo, RigInfo};
 use crate::robot::Robot;
 use crate::scan::Scan;
 use crate::{CameraConfig, Error, scene};
+use drivers::Camera;
 use drivers::motion::MotionLimits;
 use kinematics::{Stamp, Transform};
 use std::sync::Arc;
@@ -109,6 +111,18 @@ impl Rig {
     /// order of the joint readings. Simulated time zero has the stamp 0.
     pub fn into_commanded(self, limits: &[MotionLimits]) -> Result<CommandedRig, Error> {
         CommandedRig::new(self.engine, self.info, limits)
+    }
+
+    /// The joint positions that the arm reports at the start, in the order of the joint readings.
+    pub fn start_position(&mut self) -> Result<Vec<f64>, Error> {
+        self.engine.reported_joints()
+    }
+
+    /// The cameras, in real time, on an arm that emulated motors move. Simulated time zero is now, which is `start` on the
+    /// clock of the motors.
+    pub fn into_motorized(mut self, motors: MotorHistory, start: Stamp) -> Result<Vec<Box<dyn Camera>>, Error> {
+        self.engine.follow_motors(motors, start)?;
+        Ok(LiveRig::start(self.engine, self.info, start)?.devices.cameras)
     }
 
     /// Runs in real time. Simulated time zero is now, which is `start` on the caller's clock.

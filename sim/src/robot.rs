@@ -1,7 +1,9 @@
 //! The whole robot: base motion and, if there is an arm, arm motion.
 
+use crate::Error;
 use crate::arm::{Arm, JointReading, STEP_NANOS};
 use crate::base::BaseMotion;
+use crate::motors::MotorizedArm;
 use crate::panda::{self, Joints};
 use kinematics::Transform;
 
@@ -22,9 +24,17 @@ impl RobotPose {
     }
 }
 
+/// What moves the joints of an arm.
+enum ArmMotion {
+    /// MuJoCo's dynamics.
+    Simulated(Box<Arm>),
+    /// Emulated motors, in real time.
+    Motorized(MotorizedArm),
+}
+
 /// The moving robot.
 pub(crate) struct Robot {
-    arm: Option<Arm>,
+    arm: Option<ArmMotion>,
     motion: BaseMotion,
     base_from_arm: Transform,
     n_steps: i64,
@@ -32,6 +42,7 @@ pub(crate) struct Robot {
 
 impl Robot {
     pub(crate) fn new(arm: Option<Arm>, motion: BaseMotion, base_from_arm: Transform) -> Self {
+        let arm = arm.map(|arm| ArmMotion::Simulated(Box::new(arm)));
         Self { arm, motion, base_from_arm, n_steps: 0 }
     }
 
@@ -39,22 +50,37 @@ impl Robot {
         &self.motion
     }
 
-    /// The arm, if there is one.
+    /// The arm, if there is one that the simulation moves.
     pub(crate) fn arm_mut(&mut self) -> Option<&mut Arm> {
-        self.arm.as_mut()
+        match &mut self.arm {
+            Some(ArmMotion::Simulated(arm)) => Some(arm),
+            Some(ArmMotion::Motorized(_)) | None => None,
+        }
     }
 
-    /// Advances by one step. Returns the time before the step, nanoseconds, and the joint reading at that time.
-    pub(crate) fn step(&mut self) -> (i64, Option<JointReading>) {
+    /// Replaces the arm by one that emulated motors move.
+    pub(crate) fn follow_motors(&mut self, arm: MotorizedArm) {
+        self.arm = Some(ArmMotion::Motorized(arm));
+    }
+
+    /// Advances by one step. Returns the time before the step, nanoseconds, and the joint reading at that time. Emulated
+    /// motors report their joints themselves; the step then waits for them, and fails if they have stopped.
+    pub(crate) fn step(&mut self) -> Result<(i64, Option<JointReading>), Error> {
         let nanos = self.n_steps * STEP_NANOS;
         self.n_steps += 1;
-        (nanos, self.arm.as_mut().map(Arm::step))
+        let reading = match &mut self.arm {
+            Some(ArmMotion::Simulated(arm)) => Some(arm.step()),
+            Some(ArmMotion::Motorized(arm)) if !arm.wait_until(nanos) => return Err(Error::MotorsStopped),
+            Some(ArmMotion::Motorized(_)) | None => None,
+        };
+        Ok((nanos, reading))
     }
 
-    /// The robot at a time in its recent past; `None` if the arm's readings do not cover it.
+    /// The robot at a time in its recent past; `None` if the positions of the arm do not cover it.
     pub(crate) fn at(&self, nanos: i64) -> Option<RobotPose> {
         let joints_rad = match &self.arm {
-            Some(arm) => Some(arm.position_at(nanos)?),
+            Some(ArmMotion::Simulated(arm)) => Some(arm.position_at(nanos)?),
+            Some(ArmMotion::Motorized(arm)) => Some(arm.position_at(nanos)?),
             None => None,
         };
         let world_from_base = self.motion.world_from_base(nanos as f64 * 1e-9);

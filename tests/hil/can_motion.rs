@@ -139,7 +139,7 @@ impl Motors {
         self.observed().iter().map(|observed| observed.state).collect()
     }
 
-    fn positions(&self) -> Vec<f64> {
+    pub(crate) fn positions(&self) -> Vec<f64> {
         self.observed().iter().map(|observed| observed.position_rad).collect()
     }
 

@@ -8,6 +8,7 @@
 
 #![expect(clippy::print_stdout, reason = "tests report results from the virtual kernel")]
 
+mod arm_capture;
 mod cameras;
 mod can;
 mod can_motion;

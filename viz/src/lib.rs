@@ -58,7 +58,7 @@ pub use protocol::{BASE_PROTOCOL_VERSION, Control, PROTOCOL_VERSION};
 pub use range_scan::RangeScan;
 pub use robot::{MeshFormat, RobotDescription, RobotMesh, RobotState};
 pub use server::{Server, ServerConfig, Sharing};
-pub use updates::{KeyframePose, LiveImage, LivePixels, ModelStatus, RunResult, SceneHint, Status};
+pub use updates::{Guidance, KeyframePose, LiveImage, LivePixels, ModelStatus, RunResult, SceneHint, Status};
 
 /// Handles the messages of a client, one per line, and panics if a result is inconsistent.
 #[cfg(fuzzing)]

@@ -29,6 +29,18 @@ pub struct Status {
     pub notes: Vec<String>,
     /// The result, once the run has ended and its model is saved.
     pub result: Option<RunResult>,
+    /// What the operator should do, for commands that take images without training.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub guidance: Option<Guidance>,
+}
+
+/// What the operator should do next. While there is guidance, the page shows the camera images instead of a model.
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+pub struct Guidance {
+    /// What was done so far, and what to do next.
+    pub text: String,
+    /// Whether nothing is left to do, so that the server may stop.
+    pub is_finished: bool,
 }
 
 /// Result of a run that has ended.

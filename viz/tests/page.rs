@@ -180,7 +180,7 @@ fn publish_updates(hub: &Hub) {
             ..ModelStatus::default()
         }],
         notes: Vec::new(),
-        result: None,
+        ..Status::default()
     });
 }
 

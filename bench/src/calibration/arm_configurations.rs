@@ -116,6 +116,7 @@ fn run(chain: &Chain, angle_deg: f64, estimates_joints: bool, seed: u64) -> Run 
         setup: Setup::EyeInHand,
         samples,
         intrinsics: Some(lens),
+        intrinsics_covariance: None,
         board_symmetries: &[],
         chain: Some(chain),
         options: HandEyeOptions { estimate_joint_offsets: estimates_joints, ..HandEyeOptions::default() },

@@ -1,21 +1,19 @@
 //! How often the confidence ellipsoid of the reported uncertainty contains the truth.
 
+use super::CoverageScenes;
 use super::method::squared_error;
 use super::scene::{self, Noise, Scene, brown_conrady, camera_from_board, intrinsics, view};
 use calibration::hand_eye::{HandEyeOptions, calibrate_hand_eye};
-use calibration::{BoardView, IntrinsicsInput, LensModel, calibrate_intrinsics};
-use kinematics::Lens;
+use calibration::{BoardView, IntrinsicsCalibration, IntrinsicsInput, LensModel, calibrate_intrinsics};
 use kinematics::quantile::median;
 use kinematics::random::Random;
+use kinematics::{Intrinsics, Lens};
 use nalgebra::DVector;
 use rayon::prelude::{IntoParallelIterator, ParallelIterator};
 use serde::Serialize;
 
-/// Images or poses per calibration.
-const N_POSES: usize = 15;
 /// Standard deviation of the rotation of the camera, radians.
 const SPREAD_RAD: f64 = 0.4;
-const CORNER_PX: f64 = 0.1;
 
 /// Results of one kind of calibration.
 #[derive(Clone, Debug, Serialize)]
@@ -63,53 +61,89 @@ fn p95(mut values: Vec<f64>) -> f64 {
     kinematics::quantile::quantile(&mut values, 0.95, kinematics::quantile::Rank::Upper).unwrap_or(f64::NAN)
 }
 
-/// Measures all kinds with `n_runs` seeds each.
-pub(super) fn measure(n_runs: u64) -> Vec<Coverage> {
-    let no_robot_noise = Noise { corner_px: CORNER_PX, robot_rad: 0.0, robot_m: 0.0 };
+/// Measures all kinds.
+pub(super) fn measure(scenes: CoverageScenes) -> Vec<Coverage> {
+    let seeds = scenes.first_seed..scenes.first_seed + scenes.runs;
+    let no_robot_noise = Noise { corner_px: scenes.corner_px, robot_rad: 0.0, robot_m: 0.0 };
     let robot_noise = Noise { robot_rad: 3e-4, robot_m: 3e-4, ..no_robot_noise };
-    let hand_eye = |name, noise: Noise, has_poses: bool, options: HandEyeOptions| {
-        let runs = (0..n_runs).into_par_iter().map(|seed| hand_eye_run(seed, noise, has_poses, options));
+    let hand_eye = |name, noise: Noise, given: Given, options: HandEyeOptions| {
+        let runs = seeds.clone().into_par_iter().map(|seed| hand_eye_run(seed, scenes.n_poses, noise, given, options));
         Coverage::of(name, ["mm", "degrees"], runs.collect())
     };
     let lens = |name, lens: Lens, model: LensModel| {
-        let runs = (0..n_runs).into_par_iter().map(|seed| intrinsics_run(seed, lens, model));
+        let runs = seeds.clone().into_par_iter().map(|seed| intrinsics_run(seed, scenes, lens, model));
         Coverage::of(name, ["px", "px"], runs.collect())
     };
     let default = HandEyeOptions::default();
     let with_lens = HandEyeOptions { estimate_intrinsics: true, ..default };
     vec![
-        hand_eye("hand-eye, no robot pose noise", no_robot_noise, false, default),
-        hand_eye("hand-eye, robot pose noise of 0.3 mm and 0.3 mrad", robot_noise, false, default),
-        hand_eye("hand-eye with lens, no robot pose noise", no_robot_noise, false, with_lens),
-        hand_eye("hand-eye from board poses, robot pose noise of 0.3 mm and 0.3 mrad", robot_noise, true, default),
+        hand_eye("hand-eye, no robot pose noise", no_robot_noise, Given::Lens, default),
+        hand_eye("hand-eye, robot pose noise of 0.3 mm and 0.3 mrad", robot_noise, Given::Lens, default),
+        hand_eye("hand-eye, lens from other images, no robot pose noise", no_robot_noise, Given::LensEstimate, default),
+        hand_eye("hand-eye with lens, no robot pose noise", no_robot_noise, Given::Lens, with_lens),
+        hand_eye(
+            "hand-eye from board poses, robot pose noise of 0.3 mm and 0.3 mrad",
+            robot_noise,
+            Given::BoardPoses,
+            default,
+        ),
         lens("lens, pinhole", Lens::Pinhole, LensModel::Pinhole),
         lens("lens, Brown-Conrady", brown_conrady(), LensModel::BrownConrady5),
         lens("lens, Kannala-Brandt", Lens::KannalaBrandt([0.03, -0.01, 0.002, 0.0]), LensModel::KannalaBrandt),
     ]
 }
 
-fn hand_eye_run(seed: u64, noise: Noise, has_poses: bool, options: HandEyeOptions) -> Option<Run> {
+/// What is given besides the robot poses.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Given {
+    /// Corners and the true lens.
+    Lens,
+    /// Corners, and the lens from other images with its covariance.
+    LensEstimate,
+    /// Board poses.
+    BoardPoses,
+}
+
+fn hand_eye_run(seed: u64, n_poses: usize, noise: Noise, given: Given, options: HandEyeOptions) -> Option<Run> {
     const N_PARAMS: usize = 6;
-    let scene = Scene::new(N_POSES, SPREAD_RAD, 1000 + seed);
+    let scene = Scene::new(n_poses, SPREAD_RAD, 1000 + seed);
     let samples = scene.samples(noise, seed);
-    let samples = if has_poses { scene::with_board_poses(&samples) } else { samples };
-    let found = calibrate_hand_eye(&scene::input(samples, options)).ok()?;
+    let samples = if given == Given::BoardPoses { scene::with_board_poses(&samples) } else { samples };
+    let mut input = scene::input(samples, options);
+    if given == Given::LensEstimate {
+        let lens =
+            lens_from_views(seed, n_poses, noise.corner_px, &intrinsics(brown_conrady()), LensModel::BrownConrady5)?;
+        (input.intrinsics, input.intrinsics_covariance) =
+            (Some(lens.intrinsics.clone()), Some(lens.intrinsics_covariance()));
+    }
+    let found = calibrate_hand_eye(&input).ok()?;
     let error = scene.flange_from_camera.inverse() * found.parent_from_camera;
     let errors = [1e3 * error.translation.vector.norm(), error.rotation.angle().to_degrees()];
     Some((chi_squared_cdf(squared_error(&found, &scene.flange_from_camera), N_PARAMS), errors))
 }
 
-fn intrinsics_run(seed: u64, lens: Lens, model: LensModel) -> Option<Run> {
+/// A lens from simulated images.
+fn lens_from_views(
+    seed: u64,
+    n_views: usize,
+    corner_px: f64,
+    truth: &Intrinsics,
+    model: LensModel,
+) -> Option<IntrinsicsCalibration> {
     let mut random = Random::new(2000 + seed);
-    let truth = intrinsics(lens);
-    let views: Vec<BoardView> = (0..N_POSES)
+    let views: Vec<BoardView> = (0..n_views)
         .map(|ix| {
-            let pose = camera_from_board(&truth, SPREAD_RAD, &mut random);
-            BoardView { name: format!("{ix}"), ..view(&truth, &pose, CORNER_PX, &mut random) }
+            let pose = camera_from_board(truth, SPREAD_RAD, &mut random);
+            BoardView { name: format!("{ix}"), ..view(truth, &pose, corner_px, &mut random) }
         })
         .collect();
-    let sizes_px = vec![truth.size_px; N_POSES];
-    let found = calibrate_intrinsics(&IntrinsicsInput { views: &views, sizes_px: &sizes_px, model }).ok()?;
+    let sizes_px = vec![truth.size_px; n_views];
+    calibrate_intrinsics(&IntrinsicsInput { views: &views, sizes_px: &sizes_px, model }).ok()
+}
+
+fn intrinsics_run(seed: u64, scenes: CoverageScenes, lens: Lens, model: LensModel) -> Option<Run> {
+    let truth = intrinsics(lens);
+    let found = lens_from_views(seed, scenes.n_poses, scenes.corner_px, &truth, model)?;
     let difference = |axes: [f64; 2], truth: [f64; 2]| (axes[0] - truth[0]).hypot(axes[1] - truth[1]);
     let errors = [
         difference(found.intrinsics.focal_px, truth.focal_px),
@@ -166,7 +200,8 @@ mod tests {
 
     #[test]
     fn reported_uncertainty_covers_the_truth() {
-        for coverage in measure(12) {
+        let scenes = CoverageScenes { runs: 12, first_seed: 0, n_poses: 15, corner_px: 0.1 };
+        for coverage in measure(scenes) {
             assert!(coverage.covered_frac > 0.7 && coverage.n_refused == 0, "{coverage:?}");
         }
     }

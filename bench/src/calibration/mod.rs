@@ -23,17 +23,49 @@ use speed::Speed;
 use stability::Cell;
 use std::path::PathBuf;
 
+/// A part of the bench.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Part {
+    /// Time and error by the number of poses.
+    Speed,
+    /// Coverage of the reported uncertainty.
+    Coverage,
+    /// Failures by rotation, number of poses and outliers.
+    Stability,
+    /// Joint offsets near singular arm configurations.
+    ArmConfigurations,
+    /// Calibration of rigs without a target.
+    Rigs,
+}
+
+/// Scenes for the coverage of the reported uncertainty.
+#[derive(Clone, Copy, Debug)]
+pub struct CoverageScenes {
+    /// Calibrations per kind.
+    pub runs: u64,
+    /// Seed of the first scene.
+    pub first_seed: u64,
+    /// Images or robot poses per calibration.
+    pub n_poses: usize,
+    /// Standard deviation of the corners, pixels.
+    pub corner_px: f64,
+}
+
 /// Options of [`run`].
 #[derive(Clone, Debug)]
 pub struct CalibrationOptions {
-    /// Calibrations per kind, for the coverage of the reported uncertainty.
-    pub runs: u64,
+    /// What to measure.
+    pub parts: Vec<Part>,
+    /// Scenes of [`Part::Coverage`].
+    pub coverage: CoverageScenes,
     /// Scenes per number of poses or combination of conditions.
     pub seeds: u64,
-    /// Rig file for calibration without a target; skipped if `None`.
+    /// Rig file for [`Part::Rigs`]; skipped if `None`.
     pub rig: Option<PathBuf>,
     /// Number of rigs: the first camera of the rig file with different errors.
     pub rigs: u64,
+    /// Number of the first of these rigs, from 1.
+    pub first_rig: u64,
     /// Length of the scan of a rig, seconds.
     pub scan_secs: f64,
     /// Folder for charts and numbers.
@@ -50,25 +82,35 @@ struct Results {
     rigs: Vec<RigResult>,
 }
 
-/// Measures everything.
+impl CalibrationOptions {
+    /// Results of a part, or none if it was not requested.
+    fn measured<T>(&self, part: Part, measure: impl FnOnce() -> Vec<T>) -> Vec<T> {
+        if !self.parts.contains(&part) {
+            return Vec::new();
+        }
+        log::info!("{part:?}");
+        measure()
+    }
+}
+
+/// Measures the requested parts.
 ///
 /// # Errors
 ///
 /// If the rig cannot be simulated, or the folder cannot be written.
 pub fn run(options: &CalibrationOptions) -> Result<BenchResult> {
     std::fs::create_dir_all(&options.out).with_context(|| format!("cannot create {}", options.out.display()))?;
-    log::info!("speed");
-    // Before the other measurements, which use all processors.
-    let speed = speed::measure(options.seeds);
-    log::info!("coverage");
-    let coverage = coverage::measure(options.runs);
-    log::info!("stability");
-    let stability = stability::measure(options.seeds);
-    log::info!("arm configurations");
-    let arm_configurations = arm_configurations::measure(options.seeds);
-    let mut results = Results { coverage, speed, stability, arm_configurations, rigs: Vec::new() };
-    for seed in 1..=options.rig.as_ref().map_or(0, |_| options.rigs) {
-        let Some(rig) = &options.rig else { break };
+    // Speed before the other measurements, which use all processors.
+    let mut results = Results {
+        speed: options.measured(Part::Speed, || speed::measure(options.seeds)),
+        coverage: options.measured(Part::Coverage, || coverage::measure(options.coverage)),
+        stability: options.measured(Part::Stability, || stability::measure(options.seeds)),
+        arm_configurations: options.measured(Part::ArmConfigurations, || arm_configurations::measure(options.seeds)),
+        rigs: Vec::new(),
+    };
+    let rig = options.rig.as_ref().filter(|_| options.parts.contains(&Part::Rigs));
+    for seed in options.first_rig..options.first_rig + options.rigs {
+        let Some(rig) = rig else { break };
         results.rigs.push(rigs::measure(rig, seed, options.scan_secs)?);
         log::info!("rig {seed}: {:?}", results.rigs.last());
         // An interrupted bench leaves results.

@@ -14,20 +14,25 @@ const BASE_SPREAD_DEG: f64 = 20.0;
 const BASE_POSES: usize = 12;
 
 pub(super) fn findings(options: &CalibrationOptions, results: &Results) -> Findings {
-    let mut charts = vec![("-coverage", coverage_chart(&results.coverage))];
-    charts.push(("-time", speed_chart(&results.speed, "time, ms", |speed| speed.millis)));
-    charts.push(("-error", speed_chart(&results.speed, "position error, mm", |speed| speed.mm)));
-    charts.extend(stability_charts(&results.stability));
+    let (mut charts, mut tables) = (Vec::new(), Vec::new());
+    if !results.coverage.is_empty() {
+        charts.push(("-coverage", coverage_chart(&results.coverage)));
+        tables.push(coverage_table(&results.coverage));
+    }
+    if !results.speed.is_empty() {
+        charts.push(("-time", speed_chart(&results.speed, "time, ms", |speed| speed.millis)));
+        charts.push(("-error", speed_chart(&results.speed, "position error, mm", |speed| speed.mm)));
+        tables.push(speed_table(&results.speed));
+    }
+    if !results.stability.is_empty() {
+        charts.extend(stability_charts(&results.stability));
+        tables.extend([limits_table(&results.stability), totals_table(&results.stability)]);
+    }
+    if !results.arm_configurations.is_empty() {
+        tables.push(arm_configurations_table(results));
+    }
     if !results.rigs.is_empty() {
         charts.push(("-rigs", rigs_chart(results)));
-    }
-    let mut tables = vec![coverage_table(&results.coverage), speed_table(&results.speed)];
-    tables.extend([
-        limits_table(&results.stability),
-        totals_table(&results.stability),
-        arm_configurations_table(results),
-    ]);
-    if !results.rigs.is_empty() {
         tables.push(rigs_table(results));
     }
     Findings {
@@ -35,8 +40,8 @@ pub(super) fn findings(options: &CalibrationOptions, results: &Results) -> Findi
         title: "Calibration".into(),
         sentences: vec![
             format!(
-                "Simulated corners of a chessboard of 9 x 6 inner corners at 0.5 m, camera of 1280 x 720 pixels. Coverage: {} calibrations with 15 views and 0.1 px of noise per line. Other results: medians of {} scenes.",
-                options.runs, options.seeds
+                "Simulated corners of a chessboard of 9 x 6 inner corners at 0.5 m, camera of 1280 x 720 pixels. Coverage: {} calibrations with {} views and {} px of noise per line. Other results: medians of {} scenes.",
+                options.coverage.runs, options.coverage.n_poses, options.coverage.corner_px, options.seeds
             ),
             "A result has failed if its error is above 5 mm or 0.5 degrees. Closed-form solvers use board poses from the corners, like \"refined\".".into(),
             format!("fieldrig {}.", env!("CARGO_PKG_VERSION")),

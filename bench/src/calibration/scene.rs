@@ -124,6 +124,7 @@ pub(super) fn input(samples: Vec<HandEyeSample>, options: HandEyeOptions) -> Han
         setup: Setup::EyeInHand,
         samples,
         intrinsics: has_corners.then(|| intrinsics(brown_conrady())),
+        intrinsics_covariance: None,
         board_symmetries: &[],
         chain: None,
         options,

@@ -1,30 +1,42 @@
 //! Whether the corners contradict the given intrinsics.
 
+use super::corner_fit::CornerState;
 use super::geometry::{N_PARAMS, Solution};
+use super::propagation::propagated;
 use super::selection::{Free, Selection, corner_fit};
+use crate::least_squares::Fit;
 use kinematics::Intrinsics;
 use nalgebra::{DMatrix, DVector};
 
 /// The corners contradict the given intrinsics.
 pub(super) struct IntrinsicsDoubt {
     free: Solution,
-    free_covariance: DMatrix<f64>,
+    by_intrinsics: DMatrix<f64>,
     pub(super) warning: String,
 }
 
 impl IntrinsicsDoubt {
-    /// `None` if free intrinsics do not fit significantly better.
-    pub(super) fn new(selection: Selection<'_>, intrinsics: &Intrinsics) -> Option<Self> {
-        let fit = |is_free: bool| {
-            let free = Free { intrinsics: is_free, joints: false };
-            corner_fit(selection, intrinsics, &[], free).ok()
-        };
-        let (fixed, free) = (fit(false)?, fit(true)?);
+    /// `None` if free intrinsics do not fit significantly better, or differ by no more than the uncertainty of the given
+    /// ones explains.
+    ///
+    /// * `free`: fit with free intrinsics.
+    pub(super) fn new(
+        selection: Selection<'_>,
+        intrinsics: &Intrinsics,
+        free: &Fit<CornerState>,
+        covariance: Option<&DMatrix<f64>>,
+    ) -> Option<Self> {
+        let fixed = corner_fit(selection, intrinsics, &[], Free { intrinsics: false, joints: false }).ok()?;
         // Twice the decrease of the cost has as many degrees of freedom as there are intrinsics. Residuals of real
         // images are not independent, so their variance scales it, and the limit is generous.
         let n_params = intrinsics.params().len() as f64;
         let decrease = 2.0 * (fixed.cost - free.cost) / free.variance.max(1.0);
-        (decrease > n_params + 6.0 * (2.0 * n_params).sqrt()).then_some(())?;
+        let limit = n_params + 6.0 * (2.0 * n_params).sqrt();
+        (decrease > limit).then_some(())?;
+        if covariance.is_some_and(|given| squared_change(intrinsics, free, given).is_some_and(|square| square < limit))
+        {
+            return None;
+        }
         let change = fixed.state.solution.x.inverse() * free.state.solution.x;
         let warning = format!(
             "the corners contradict the given intrinsics: with free intrinsics, {}, and the camera moves by {:.1} mm and {:.2} degrees, which is included in the uncertainty; calibrate the intrinsics with calibrate intrinsics, or estimate them together with the pose (--with-intrinsics)",
@@ -32,12 +44,11 @@ impl IntrinsicsDoubt {
             1e3 * change.translation.vector.norm(),
             change.rotation.angle().to_degrees()
         );
-        let free_covariance = free.covariance.view((0, 0), (N_PARAMS, N_PARAMS)).into_owned();
-        Some(Self { free: free.state.solution, free_covariance, warning })
+        Some(Self { free: free.state.solution, by_intrinsics: propagated(free, None)?, warning })
     }
 
-    /// Covariance to add to that of a solution with the given intrinsics: that of free intrinsics, and the square of the
-    /// difference.
+    /// Covariance to add to that of a solution with the given intrinsics: the effect of the uncertainty of free intrinsics,
+    /// and the square of the difference.
     pub(super) fn covariance(&self, solution: &Solution) -> DMatrix<f64> {
         let mut shift = DVector::zeros(N_PARAMS);
         for (first, from, to) in [(0, solution.x, self.free.x), (6, solution.y, self.free.y)] {
@@ -45,8 +56,20 @@ impl IntrinsicsDoubt {
             shift.fixed_rows_mut::<3>(first).copy_from(&change.rotation.scaled_axis());
             shift.fixed_rows_mut::<3>(first + 3).copy_from(&change.translation.vector);
         }
-        &self.free_covariance + &shift * shift.transpose()
+        &self.by_intrinsics + &shift * shift.transpose()
     }
+}
+
+/// Squared change of the intrinsics relative to the uncertainty of both, given and free ones. `None` if neither is
+/// uncertain.
+fn squared_change(given: &Intrinsics, free: &Fit<CornerState>, covariance: &DMatrix<f64>) -> Option<f64> {
+    let params = given.params();
+    let changes = free.state.intrinsics.params().into_iter().zip(&params).map(|(free, given)| free - given);
+    let change = DVector::from_iterator(params.len(), changes);
+    let n = params.len();
+    let of_free = free.covariance.view((N_PARAMS, N_PARAMS), (n, n));
+    let total = covariance + of_free;
+    Some(change.dot(&total.cholesky()?.solve(&change)))
 }
 
 /// The changes of focal length and principal point, the larger one first.

@@ -20,6 +20,7 @@ mod mistakes;
 mod next_poses;
 mod planar_pose;
 mod pose_fit;
+mod propagation;
 mod reach;
 mod refine;
 mod refusal;
@@ -47,6 +48,7 @@ pub use shutter::{FlangeMotion, corners_at_mid_exposure};
 
 use crate::{BoardView, Error};
 use kinematics::{Chain, Intrinsics, Transform, transform};
+use nalgebra::{DMatrix, SymmetricEigen};
 use samples::Sorted;
 
 /// Where the camera and the board are mounted.
@@ -89,6 +91,9 @@ pub struct HandEyeInput<'a> {
     pub samples: Vec<HandEyeSample>,
     /// Lens parameters. Needed for corners; initial values if they are estimated.
     pub intrinsics: Option<Intrinsics>,
+    /// Covariance of the given intrinsics in the order of [`Intrinsics::params`], which enlarges that of the result. `None`:
+    /// the intrinsics are taken as exact. Not used if they are estimated.
+    pub intrinsics_covariance: Option<DMatrix<f64>>,
     /// Rotations of the board after which it looks the same, `board_from_equivalent_board`: for example a half turn
     /// about the center of a chessboard whose numbers of inner corners are both even or both odd. Empty if the
     /// orientation is unique.
@@ -152,6 +157,7 @@ pub const MIN_SAMPLES: usize = 3;
 ///     setup: Setup::EyeInHand,
 ///     samples: samples.into(),
 ///     intrinsics: None,
+///     intrinsics_covariance: None,
 ///     board_symmetries: &[],
 ///     chain: None,
 ///     options: HandEyeOptions::default(),
@@ -273,6 +279,9 @@ fn check(input: &HandEyeInput<'_>) -> Result<(), Error> {
         None if n_views > 0 => return invalid("the samples have corners, but the intrinsics are missing".to_owned()),
         None => (),
     }
+    if let (Some(intrinsics), Some(covariance)) = (&input.intrinsics, &input.intrinsics_covariance) {
+        check_covariance(covariance, intrinsics.params().len()).or_else(invalid)?;
+    }
     if options.estimate_joint_offsets {
         let Some(chain) = input.chain else {
             return invalid("joint offsets need the chain of the arm (a URDF)".to_owned());
@@ -293,6 +302,26 @@ fn check(input: &HandEyeInput<'_>) -> Result<(), Error> {
         check_joints(&input.samples, chain)?;
     }
     Ok(())
+}
+
+/// Rejects a matrix that is not a covariance of `n` parameters.
+fn check_covariance(covariance: &DMatrix<f64>, n: usize) -> Result<(), String> {
+    const ROUNDING: f64 = 1e-6;
+    let [rows, columns] = [covariance.nrows(), covariance.ncols()];
+    if [rows, columns] != [n, n] {
+        return Err(format!("the covariance of the intrinsics is {rows} x {columns}, but there are {n} parameters"));
+    }
+    if covariance.iter().any(|value| !value.is_finite()) {
+        return Err("the covariance of the intrinsics is not finite".to_owned());
+    }
+    let scales = covariance.diagonal().map(|variance| variance.abs().max(f64::MIN_POSITIVE).sqrt());
+    let correlation = DMatrix::from_fn(n, n, |row, column| covariance[(row, column)] / (scales[row] * scales[column]));
+    let is_symmetric = (&correlation - correlation.transpose()).amax() < ROUNDING;
+    let is_positive = SymmetricEigen::new(correlation).eigenvalues.min() > -ROUNDING;
+    match is_symmetric && is_positive && covariance.diagonal().min() >= 0.0 {
+        true => Ok(()),
+        false => Err("the covariance of the intrinsics is not symmetric and positive; copy all its digits".to_owned()),
+    }
 }
 
 /// Rejects joint values that do not explain the motion of the flange.

@@ -8,6 +8,7 @@ use super::geometry::{self, N_PARAMS, Solution};
 use super::intrinsics_doubt::IntrinsicsDoubt;
 use super::planar_pose;
 use super::pose_fit::{self, HandEyeNoise, Measurement, PoseFit};
+use super::propagation::propagated;
 use super::samples::{self, Sample};
 use super::selection::{Free, Selection, Stage, corner_fit, corner_noise, corners, reject_and_fit, select};
 use super::{HandEyeInput, Refusal};
@@ -79,14 +80,19 @@ pub(super) fn refine(
 
     let is_free = input.options.estimate_intrinsics || input.options.estimate_joint_offsets;
     if !is_free {
-        let doubt =
-            IntrinsicsDoubt::new(Selection { input, samples: &samples, choice: &choice, stage: &stage }, &given);
+        let selection = Selection { input, samples: &samples, choice: &choice, stage: &stage };
+        let lens = input.intrinsics_covariance.as_ref();
+        let free = corner_fit(selection, &given, &[], Free { intrinsics: true, joints: false }).ok();
+        let doubt = free.as_ref().and_then(|free| IntrinsicsDoubt::new(selection, &given, free, lens));
+        let by_lens = free.as_ref().and_then(|free| propagated(free, Some(lens?)));
         (stage.fit, stage.weighting) =
             choose_weights(Selection { input, samples: &samples, choice: &choice, stage: &stage }, &given)?;
         stage.fit.solution =
             minimize_corners(Selection { input, samples: &samples, choice: &choice, stage: &stage }, &given)?;
         if let Some(doubt) = &doubt {
             stage.fit.covariance += doubt.covariance(&stage.fit.solution);
+        } else if let Some(by_lens) = by_lens {
+            stage.fit.covariance += by_lens;
         }
         let mut refined = finish(samples, choice, stage, closed_form, Some(given));
         refined.intrinsics_doubt = doubt.map(|doubt| doubt.warning);
@@ -103,7 +109,10 @@ pub(super) fn refine(
         Selection { input: &corrected, samples: &samples, choice: &choice, stage: &stage },
         &intrinsics,
     )?;
-    stage.fit.covariance += free.covariance.view((0, 0), (N_PARAMS, N_PARAMS));
+    match propagated(&free, None) {
+        Some(by_others) => stage.fit.covariance += by_others,
+        None => stage.fit.covariance += free.covariance.view((0, 0), (N_PARAMS, N_PARAMS)),
+    }
     let n_intrinsics = if input.options.estimate_intrinsics { intrinsics.params().len() } else { 0 };
     let mut refined = finish(samples, choice, stage, closed_form, Some(intrinsics));
     refined.intrinsics_sigma = (0..n_intrinsics).map(|ix| free.sigma(N_PARAMS + ix)).collect();

@@ -147,6 +147,7 @@ impl Scene {
             setup: self.setup,
             samples,
             intrinsics: has_views.then(intrinsics),
+            intrinsics_covariance: None,
             board_symmetries: &[],
             chain: None,
             options: HandEyeOptions::default(),

@@ -51,11 +51,27 @@ pub struct IntrinsicsCalibration {
     pub next_view: Option<NextView>,
 }
 
+impl IntrinsicsCalibration {
+    /// Covariance of [`Intrinsics::params`]. Coefficients that were not estimated count as exact.
+    pub fn intrinsics_covariance(&self) -> DMatrix<f64> {
+        let n = self.intrinsics.params().len();
+        let mut covariance = DMatrix::zeros(n, n);
+        for (row, param) in self.params.iter().enumerate() {
+            for (column, other) in self.params.iter().enumerate() {
+                covariance[(param.ix, other.ix)] = self.covariance[(row, column)];
+            }
+        }
+        covariance
+    }
+}
+
 /// An estimated parameter.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct EstimatedParam {
     /// `fx`, `fy`, `cx`, `cy` (pixels), or OpenCV's name of a coefficient.
     pub name: &'static str,
+    /// Index in [`Intrinsics::params`].
+    pub ix: usize,
     /// The estimate.
     pub value: f64,
     /// Its standard deviation.
@@ -195,8 +211,12 @@ pub(super) fn report(
     let params = coefficients.params();
     let values = fit.state.intrinsics.params();
     let estimated = coefficients.names().into_iter().zip(&params).enumerate();
-    let estimated =
-        estimated.map(|(ix, (name, param))| EstimatedParam { name, value: values[*param], sigma: fit.sigma(ix) });
+    let estimated = estimated.map(|(ix, (name, param))| EstimatedParam {
+        name,
+        ix: *param,
+        value: values[*param],
+        sigma: fit.sigma(ix),
+    });
     let images: Vec<ImageFit> = kept
         .image_ixs
         .iter()

@@ -29,7 +29,8 @@ pub(super) struct Fit {
 impl Fit {
     /// Adds the discretization error to the covariance: the change of the estimate between the finest level and the next
     /// one. All pairs share this error, so that their scatter does not contain it. At half the pixel size, an error of
-    /// first or higher order in the pixel size is at most as large as this change.
+    /// first or higher order in the pixel size is at most as large as this change. Its direction may be another one, because
+    /// the error is the sum of many, some of which do not depend on the pixel size in the same way.
     pub(super) fn add_discretization_error(&mut self, images: &[PreparedImage], pairs: &[Pair]) {
         const LEVEL: usize = 1;
         if images.iter().all(|image| image.levels.len() <= LEVEL) {

@@ -255,6 +255,7 @@ fn body_transform(
         setup: Setup::EyeInHand,
         samples: samples.collect(),
         intrinsics: None,
+        intrinsics_covariance: None,
         board_symmetries: &[],
         chain: None,
         options: HandEyeOptions { board_is_seen: false, ..HandEyeOptions::default() },

@@ -71,7 +71,7 @@ fn with_readings(images: impl IntoIterator<Item = Image>) -> Vec<Sample> {
 fn read(rig: Rig, samples: Vec<Sample>) -> crate::Result<CalibrationImages> {
     let source = Box::new(Samples(samples.into_iter()));
     let opened = Opened { rig, source, damage: Arc::default(), stamp_clock: StampClock::Unrelated };
-    calibration_images(opened, "wrist", 3.0, |_| false, &mut |_| ())
+    calibration_images(opened, "wrist", 3.0, |_, _| ControlFlow::Continue(()))
 }
 
 #[test]
@@ -93,7 +93,7 @@ fn rows_have_the_poses_of_their_exposures() {
     // Fast images are kept with a large limit.
     let source = Box::new(Samples(with_readings([image(1.2)]).into_iter()));
     let opened = Opened { rig: arm_rig(), source, damage: Arc::default(), stamp_clock: StampClock::Unrelated };
-    let found = calibration_images(opened, "wrist", 1e3, |_| false, &mut |_| ()).unwrap();
+    let found = calibration_images(opened, "wrist", 1e3, |_, _| ControlFlow::Continue(())).unwrap();
     let arm = found.images[0].arm.as_ref().unwrap();
     // 1 rad/s over the readout time of 10 ms.
     let angles = [0.0, 0.5, 1.0].map(|row_frac| arm.base_from_flange_at(row_frac).rotation.angle());
@@ -120,7 +120,11 @@ fn depth_and_other_cameras_are_ignored_and_the_end_is_respected() {
     assert_eq!((found.images.len(), found.n_read), (0, 0));
     let source = Box::new(Samples(with_readings([image(0.5), image(1.7)]).into_iter()));
     let opened = Opened { rig: arm_rig(), source, damage: Arc::default(), stamp_clock: StampClock::Unrelated };
-    let found = calibration_images(opened, "wrist", 3.0, |sample| sample.stamp() > stamp(1.0), &mut |_| ()).unwrap();
+    let until_one_second = |sample: &Sample, _: &[CalibrationImage]| match sample.stamp() > stamp(1.0) {
+        true => ControlFlow::Break(()),
+        false => ControlFlow::Continue(()),
+    };
+    let found = calibration_images(opened, "wrist", 3.0, until_one_second).unwrap();
     assert_eq!(found.images.len(), 1);
 }
 
@@ -138,10 +142,12 @@ fn images_of_a_robot_without_an_arm_have_an_interval() {
 fn unknown_cameras_and_moving_bases_are_rejected() {
     let source = || Box::new(Samples(Vec::new().into_iter()));
     let open = |rig| Opened { rig, source: source(), damage: Arc::default(), stamp_clock: StampClock::Unrelated };
-    let error = calibration_images(open(arm_rig()), "front", 3.0, |_| false, &mut |_| ()).unwrap_err().to_string();
+    let error =
+        calibration_images(open(arm_rig()), "front", 3.0, |_, _| ControlFlow::Continue(())).unwrap_err().to_string();
     assert!(error.contains("no camera \"front\"; it has wrist"), "{error}");
     let mut moving = arm_rig();
     moving.base.driver = crate::config::BaseDriver::Udp;
-    let error = calibration_images(open(moving), "wrist", 3.0, |_| false, &mut |_| ()).unwrap_err().to_string();
+    let error =
+        calibration_images(open(moving), "wrist", 3.0, |_, _| ControlFlow::Continue(())).unwrap_err().to_string();
     assert!(error.contains("base.driver"), "{error}");
 }

@@ -40,6 +40,8 @@ keys! {
         pub parent_from_camera: Transform = Transform::identity();
         /// Lens and size of the color images.
         pub intrinsics: Intrinsics = PLACEHOLDER_INTRINSICS;
+        /// Covariance of [`Intrinsics::params`], row by row; empty if it is unknown.
+        pub intrinsics_covariance: Vec<f64> = Vec::new();
         /// Depth images, if the camera delivers them.
         pub depth: Option<Depth> => None;
         /// Settings of [`CameraDriver::V4l2`] and [`CameraDriver::Nokhwa`].

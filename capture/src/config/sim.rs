@@ -19,6 +19,8 @@ keys! {
         pub ideal: bool = false;
         /// Whether the simulation waits for its consumer and always gives the same samples.
         pub lockstep: bool = false;
+        /// Whether an arm that is moved with `--sim` keeps its driver, which then moves emulated motors in real time.
+        pub emulate_arm: bool = false;
         /// Speed factor of the scanning motion.
         pub speed: f64 = 1.0, in 0.01..=2.0;
         /// Whether the camera rotates only about the vertical axis.

@@ -83,7 +83,7 @@ fn with(key: &'static str, value: &str) -> Result<Rig, ConfigError> {
 }
 
 /// Key, a valid value that differs from the current one, and an invalid value.
-const KEYS: [(&str, &str, &str); 181] = [
+const KEYS: [(&str, &str, &str); 183] = [
     ("arm.rate_hz", "500", "0"),
     ("arm.bus.can0.bitrate_hz", "500_000", "1"),
     ("arm.bus.can0.data_bitrate_hz", "5_000_000", "9_000_000"),
@@ -161,6 +161,7 @@ const KEYS: [(&str, &str, &str); 181] = [
     ("camera.wrist.parent", "'base'", "'tool'"),
     ("camera.wrist.parent_from_camera.xyz_m", "[0, 0, 0.2]", "[0, 0, inf]"),
     ("camera.wrist.parent_from_camera.quat_xyzw", "[0, 1, 0, 0]", "[0, 0, 0, 0]"),
+    ("camera.wrist.intrinsics_covariance", "[1, 0]", "1"),
     ("camera.wrist.intrinsics.focal_px", "[500, 501]", "[0, 500]"),
     ("camera.wrist.intrinsics.principal_px", "[321, 241]", "[nan, 240]"),
     ("camera.wrist.intrinsics.lens", "'pinhole'", "'fisheye'"),
@@ -249,6 +250,7 @@ const KEYS: [(&str, &str, &str); 181] = [
     ("sim.lockstep", "true", "1"),
     ("sim.speed", "0.5", "3"),
     ("sim.azimuth_only", "true", "1"),
+    ("sim.emulate_arm", "true", "1"),
     ("sim.duration_secs", "60", "0"),
     ("sim.n_images", "300", "0"),
     ("sim.truth", "false", "0"),

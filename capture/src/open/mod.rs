@@ -1,5 +1,7 @@
 //! Opens the devices of a rig file, or a recording, as one source of samples.
 
+#[cfg(all(feature = "sim", target_os = "linux"))]
+mod emulated;
 mod movable;
 mod real;
 mod realsense;

@@ -29,6 +29,7 @@ pub fn movable(rig: &Rig, devices: Devices, camera: &str) -> crate::Result<Movab
     let Some(driver) = rig.cameras.first().map(|camera| camera.driver) else {
         bail!("the rig has no camera {camera:?}");
     };
+    let arm_driver = rig.arm.driver;
     if devices == Devices::Sim {
         use_simulated_devices(&mut rig);
     } else if (rig.arm.driver == ArmDriver::Sim) != (driver == CameraDriver::Sim) {
@@ -43,6 +44,10 @@ pub fn movable(rig: &Rig, devices: Devices, camera: &str) -> crate::Result<Movab
     check_arm(&rig)?;
     if rig.arm.driver == ArmDriver::Sim {
         check_intrinsics(&rig)?;
+        if rig.sim.emulate_arm && arm_driver != ArmDriver::Sim {
+            rig.arm.driver = arm_driver;
+            return emulated(rig);
+        }
         return simulated(rig);
     }
     // The camera first: the arm is enabled only if everything else works. It is opened for motion, not for reading.
@@ -69,6 +74,17 @@ fn simulated(rig: Rig) -> crate::Result<Movable> {
         bail!("the simulated rig has no camera");
     };
     Ok(Movable { rig, arm, camera })
+}
+
+#[cfg(all(feature = "sim", target_os = "linux"))]
+fn emulated(mut rig: Rig) -> crate::Result<Movable> {
+    let (arm, camera) = super::emulated::open(&mut rig)?;
+    Ok(Movable { rig, arm, camera })
+}
+
+#[cfg(not(all(feature = "sim", target_os = "linux")))]
+fn emulated(_rig: Rig) -> crate::Result<Movable> {
+    bail!("sim.emulate_arm needs Linux and a program built with `cargo build --release --features sim`")
 }
 
 #[cfg(not(feature = "sim"))]

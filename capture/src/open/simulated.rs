@@ -38,9 +38,12 @@ pub(super) fn open(rig: &Rig, real: Devices) -> crate::Result<Box<dyn Source>> {
 
 /// Opens a simulated rig with an arm that moves by commands.
 pub(super) fn commanded(rig: &Rig, limits: &[MotionLimits]) -> crate::Result<sim::CommandedRig> {
-    let mut config = config_of(rig)?;
-    (config.duration_secs, config.n_images, config.truth) = (None, None, false);
-    Ok(sim::open(&config)?.into_commanded(limits)?)
+    Ok(sim::open(&unlimited(rig)?)?.into_commanded(limits)?)
+}
+
+/// The simulator configuration of a rig whose arm is commanded: without end and ground truth.
+pub(super) fn unlimited(rig: &Rig) -> crate::Result<sim::Config> {
+    Ok(sim::Config { duration_secs: None, n_images: None, truth: false, ..config_of(rig)? })
 }
 
 /// Live simulated devices with their ground truth.

@@ -1,13 +1,21 @@
 //! Emulates a Franka controller whose arm follows a script until a client moves it.
 
 use super::JointTrack;
+use crate::MotorHistory;
 use drivers::Error;
-use drivers::franka::emulated::{EmulatedRobot, Joints, RobotConfig};
+use drivers::franka::emulated::{CommandedJoints, EmulatedRobot, Joints, RobotConfig};
+use kinematics::JointState;
 
 /// Accepts clients until it is dropped. Once a client has moved the arm, it follows client commands only.
-pub fn emulate_fci(track: JointTrack, config: RobotConfig) -> Result<EmulatedRobot, Error> {
+///
+/// * `motors`: gets the joints once per millisecond.
+pub fn emulate_fci(
+    track: JointTrack,
+    config: RobotConfig,
+    motors: Option<MotorHistory>,
+) -> Result<EmulatedRobot, Error> {
     let mut is_client_controlled = false;
-    let joint_simulator = move |now, client_target: &drivers::franka::emulated::CommandedJoints| {
+    let mut simulate_joints = move |now, client_target: &CommandedJoints| {
         if client_target.is_moving && !std::mem::replace(&mut is_client_controlled, true) {
             log::info!("a client controls the arm: it no longer follows the script");
         }
@@ -23,6 +31,14 @@ pub fn emulate_fci(track: JointTrack, config: RobotConfig) -> Result<EmulatedRob
             torque_nm: to_joint_array(state.effort),
             ..Joints::default()
         }
+    };
+    let joint_simulator = move |now, client_target: &CommandedJoints| {
+        let joints = simulate_joints(now, client_target);
+        if let Some(motors) = &motors {
+            let (position, velocity) = (joints.position_rad.to_vec(), joints.velocity_rad_s.to_vec());
+            motors.record(JointState { stamp: now, position, velocity, effort: Vec::new() });
+        }
+        joints
     };
     EmulatedRobot::start(config, Box::new(joint_simulator))
 }

@@ -86,6 +86,13 @@ impl JointTrack {
         Ok(Self { history, end_states: [at_rest(first), at_rest(last)], playback_clock })
     }
 
+    /// Joints that rest at a position.
+    pub fn at_rest(position: Vec<f64>) -> Result<Self, HistoryError> {
+        let velocity = vec![0.0; position.len()];
+        let state = JointState { stamp: Stamp::default(), position, velocity, effort: Vec::new() };
+        Self::new(&[state], PlaybackClock { scripted: Stamp::default(), emulated: Stamp::default() })
+    }
+
     /// The joints at playback time `now`, which is the stamp of the result.
     pub fn at(&self, now: Stamp) -> JointState {
         let [first, last] = &self.end_states;

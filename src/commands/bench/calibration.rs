@@ -2,15 +2,56 @@
 
 use super::runs_args::print_result;
 use crate::exit::Exit;
-use bench::calibration::CalibrationOptions;
+use bench::calibration::{CalibrationOptions, CoverageScenes, Part};
 use std::path::PathBuf;
+
+/// A part of the bench.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+enum PartArg {
+    /// Time and error by the number of poses
+    Speed,
+    /// How often the 95 % ellipsoid contains the truth
+    Coverage,
+    /// Failures by rotation, number of poses and outliers
+    Stability,
+    /// Joint offsets near singular configurations of an arm
+    Arm,
+    /// Calibration without a target
+    Rigs,
+}
+
+const ALL_PARTS: [PartArg; 5] = [PartArg::Speed, PartArg::Coverage, PartArg::Stability, PartArg::Arm, PartArg::Rigs];
+
+impl From<PartArg> for Part {
+    fn from(part: PartArg) -> Self {
+        match part {
+            PartArg::Speed => Self::Speed,
+            PartArg::Coverage => Self::Coverage,
+            PartArg::Stability => Self::Stability,
+            PartArg::Arm => Self::ArmConfigurations,
+            PartArg::Rigs => Self::Rigs,
+        }
+    }
+}
 
 /// Flags of `bench calibration`.
 #[derive(Clone, Debug, clap::Args)]
 pub(crate) struct Args {
+    /// What to measure; rigs need --rig
+    #[arg(long, value_name = "PART", value_delimiter = ',', value_enum, default_values_t = ALL_PARTS)]
+    parts: Vec<PartArg>,
     /// Calibrations per kind, for the coverage of the reported uncertainty
     #[arg(long, value_name = "N", default_value_t = 200, value_parser = clap::value_parser!(u64).range(1..=100_000))]
     runs: u64,
+    /// With coverage: images or robot poses per calibration
+    #[arg(long, value_name = "N", default_value_t = 15, value_parser = clap::value_parser!(u16).range(5..=1000))]
+    poses: u16,
+    /// With coverage: standard deviation of the corners in pixels
+    #[arg(long, value_name = "PX", default_value_t = 0.1, value_parser = super::super::number_in_range(0.001..=10.0))]
+    corner_px: f64,
+    /// With coverage: seed of the first scene
+    #[arg(long, value_name = "N", default_value_t = 0, value_parser = clap::value_parser!(u64).range(0..=1_000_000))]
+    first_seed: u64,
     /// Scenes per number of poses and per combination of conditions
     #[arg(long, value_name = "N", default_value_t = 4, value_parser = clap::value_parser!(u64).range(1..=1000))]
     seeds: u64,
@@ -20,6 +61,9 @@ pub(crate) struct Args {
     /// With --rig: number of rigs, each with another seed and direction of the error
     #[arg(long, value_name = "N", default_value_t = 10, requires = "rig", value_parser = clap::value_parser!(u64).range(1..=1000))]
     rigs: u64,
+    /// With --rig: number of the first rig
+    #[arg(long, value_name = "N", default_value_t = 1, requires = "rig", value_parser = clap::value_parser!(u64).range(1..=1000))]
+    first_rig: u64,
     /// With --rig: length of each scan in seconds
     #[arg(long, value_name = "S", default_value_t = 30.0, requires = "rig", value_parser = super::super::number_in_range(1.0..=3600.0))]
     seconds: f64,
@@ -32,8 +76,11 @@ pub(crate) struct Args {
 }
 
 pub(super) fn run(args: &Args) -> anyhow::Result<Exit> {
-    let Args { runs, seeds, rig, rigs, seconds, out, .. } = args.clone();
-    let options = CalibrationOptions { runs, seeds, rig, rigs, scan_secs: seconds, out };
+    let Args { parts, runs, first_seed, poses, corner_px, seeds, rig, rigs, first_rig, seconds, out, .. } =
+        args.clone();
+    let parts = parts.into_iter().map(Part::from).collect();
+    let coverage = CoverageScenes { runs, first_seed, n_poses: poses.into(), corner_px };
+    let options = CalibrationOptions { parts, coverage, seeds, rig, rigs, first_rig, scan_secs: seconds, out };
     print_result(&bench::calibration::run(&options)?, args.json)?;
     Ok(Exit::Done)
 }

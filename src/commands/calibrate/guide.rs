@@ -1,10 +1,12 @@
 //! Guidance while devices are read: what the images cover so far, and what to do next.
 
 use super::images::{self, DetectedImage};
+use super::page::GuidancePage;
 use calibration::hand_eye::{HandEyeAdvice, HandEyeGuidance, Setup};
 use calibration::{BoardView, IntrinsicsAdvice, IntrinsicsGuidance};
 use capture::CalibrationImage;
 use capture::config::{Camera, Parent};
+use drivers::Sample;
 use indicatif::ProgressBar;
 use kinematics::Transform;
 use targets::TargetSpec;
@@ -18,30 +20,46 @@ pub(super) enum Purpose {
     HandEye,
 }
 
-/// Detects the target in each image as it arrives, and prints what to do next: in a progress bar, or as lines if stderr is
-/// not a terminal.
+/// Detects the target in each image as it arrives, and shows what to do next: on the page and in a progress bar, or as lines
+/// if stderr is not a terminal.
 pub(super) struct Guide<'a> {
     target: &'a TargetSpec,
     camera: &'a Camera,
     purpose: Purpose,
     bar: ProgressBar,
+    page: GuidancePage,
     views: Vec<BoardView>,
     base_from_flange: Vec<Transform>,
     detected: Vec<DetectedImage>,
 }
 
 impl<'a> Guide<'a> {
-    pub(super) fn new(target: &'a TargetSpec, camera: &'a Camera, purpose: Purpose, bar: ProgressBar) -> Self {
+    pub(super) fn new(
+        target: &'a TargetSpec,
+        camera: &'a Camera,
+        purpose: Purpose,
+        bar: ProgressBar,
+        page: GuidancePage,
+    ) -> Self {
         let (views, base_from_flange, detected) = (Vec::new(), Vec::new(), Vec::new());
-        let guide = Self { target, camera, purpose, bar, views, base_from_flange, detected };
+        let guide = Self { target, camera, purpose, bar, page, views, base_from_flange, detected };
         guide.show(&guide.advice());
         guide
     }
 
-    /// Detects the target in the images that are new.
-    pub(super) fn update(&mut self, images: &[CalibrationImage]) {
+    /// Shows a sample if it is an image of the camera, and detects the target in the images that are new.
+    pub(super) fn update(&mut self, sample: &Sample, images: &[CalibrationImage]) {
+        if let Sample::Image(image) = sample {
+            self.page.show_live(image);
+        }
+        self.detect(images);
+    }
+
+    fn detect(&mut self, images: &[CalibrationImage]) {
         for image in &images[self.detected.len()..] {
             let detected = images::detect_in_image(image, self.target);
+            let view = detected.board.as_ref().ok().map(|board| &board.view);
+            self.page.show_searched(image.size_px, &image.gray, view);
             let text = match &detected.board {
                 Ok(board) => {
                     self.views.push(board.view.clone());
@@ -55,8 +73,10 @@ impl<'a> Guide<'a> {
         }
     }
 
-    /// The target in each image.
-    pub(super) fn into_detected(self) -> Vec<DetectedImage> {
+    /// The target in each of all images.
+    pub(super) fn finish(mut self, images: &[CalibrationImage]) -> Vec<DetectedImage> {
+        self.detect(images);
+        self.page.finish();
         self.detected
     }
 
@@ -93,6 +113,7 @@ impl<'a> Guide<'a> {
     }
 
     fn show(&self, text: &str) {
+        self.page.guide(text);
         if self.bar.is_hidden() {
             log::info!("{text}");
         } else {

@@ -144,7 +144,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         log::warn!("{warning}");
     }
     if let Some(rig) = &mut rig {
-        rig.set_intrinsics(&calibration.intrinsics)?;
+        rig.set_intrinsics(&calibration.intrinsics, Some(&calibration.intrinsics_covariance()))?;
         rig.write()?;
     }
     written?;
@@ -284,7 +284,7 @@ fn printed<'a>(calibration: &'a IntrinsicsCalibration, unused: &[Unused]) -> Pri
     const N_PINHOLE_PARAMS: usize = 4;
     let names = calibration.params.iter().map(|param| param.name);
     Printed {
-        lens: LensFile::of(&calibration.intrinsics),
+        lens: LensFile::of(&calibration.intrinsics).with_covariance(&calibration.intrinsics_covariance()),
         coefficients: names.skip(N_PINHOLE_PARAMS).collect(),
         rms_px: calibration.rms_px,
         noise_px: calibration.noise_px,

@@ -3,6 +3,7 @@
 use super::json_object::JsonObject;
 use crate::exit::BadArgument;
 use kinematics::{Intrinsics, Lens};
+use nalgebra::DMatrix;
 use serde::Serialize;
 
 /// Intrinsics in JSON files, as `calibrate intrinsics` prints them. Pixel centers are at +0.5.
@@ -18,6 +19,12 @@ pub(super) struct LensFile {
     pub(super) principal_px: [f64; 2],
     /// Coefficients in OpenCV's order.
     pub(super) distortion: Vec<f64>,
+    /// Covariance of all these parameters, row by row; empty if it is unknown.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    covariance: Vec<f64>,
+    /// Standard deviations of parameters, by their index; used if the covariance is unknown.
+    #[serde(skip)]
+    sigmas: Vec<(usize, f64)>,
 }
 
 const PINHOLE: &str = "pinhole";
@@ -26,7 +33,7 @@ const KANNALA_BRANDT: &str = "kannala_brandt";
 
 impl LensFile {
     /// Keys of a file with intrinsics, including those that `calibrate intrinsics --json` prints and that are not needed.
-    pub(super) const KEYS: [&'static str; 16] = [
+    pub(super) const KEYS: [&'static str; 17] = [
         "focal_px",
         "principal_px",
         "distortion",
@@ -37,6 +44,7 @@ impl LensFile {
         "rms_px",
         "noise_px",
         "sigma",
+        "covariance",
         "rejected",
         "images",
         "coverage",
@@ -65,6 +73,8 @@ impl LensFile {
             focal_px: object.required("focal_px", object.array("focal_px")?)?,
             principal_px: object.required("principal_px", object.array("principal_px")?)?,
             distortion: object.numbers("distortion")?.unwrap_or_default(),
+            covariance: object.numbers("covariance")?.unwrap_or_default(),
+            sigmas: object.object("sigma", &all_names())?.map_or(Ok(Vec::new()), |sigma| sigmas(&sigma, model))?,
         })
     }
 
@@ -81,7 +91,28 @@ impl LensFile {
             focal_px: intrinsics.focal_px,
             principal_px: intrinsics.principal_px,
             distortion,
+            covariance: Vec::new(),
+            sigmas: Vec::new(),
         }
+    }
+
+    pub(super) fn with_covariance(self, covariance: &DMatrix<f64>) -> Self {
+        // Symmetric, so the order of rows and columns does not matter.
+        Self { covariance: covariance.as_slice().to_vec(), ..self }
+    }
+
+    /// Covariance of [`Intrinsics::params`]. With standard deviations only, the parameters count as independent.
+    pub(super) fn covariance(&self, intrinsics: &Intrinsics) -> Result<Option<DMatrix<f64>>, BadArgument> {
+        if !self.covariance.is_empty() || self.sigmas.is_empty() {
+            return covariance_of(&self.covariance, intrinsics)
+                .map_err(|error| BadArgument(format!("intrinsics.covariance: {error}")));
+        }
+        let n = intrinsics.params().len();
+        let mut covariance = DMatrix::zeros(n, n);
+        for (ix, sigma) in self.sigmas.iter().filter(|(ix, _)| *ix < n) {
+            covariance[(*ix, *ix)] = sigma * sigma;
+        }
+        Ok(Some(covariance))
     }
 
     /// The intrinsics for images of the given size.
@@ -150,6 +181,39 @@ impl LensFile {
             list(&self.principal_px),
             self.model_name()
         )
+    }
+}
+
+/// Names of focal lengths and principal point, and of the coefficients of both kinds of lenses in OpenCV's order.
+const PLANE_NAMES: [&str; 4] = ["fx", "fy", "cx", "cy"];
+const BROWN_CONRADY_NAMES: [&str; 8] = ["k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"];
+const KANNALA_BRANDT_NAMES: [&str; 4] = ["k1", "k2", "k3", "k4"];
+
+fn all_names() -> Vec<&'static str> {
+    PLANE_NAMES.into_iter().chain(BROWN_CONRADY_NAMES).collect()
+}
+
+/// Standard deviations with the indices of their parameters.
+fn sigmas(sigma: &JsonObject<'_>, model: Option<&str>) -> Result<Vec<(usize, f64)>, BadArgument> {
+    let coefficients: &[&str] =
+        if model == Some(KANNALA_BRANDT) { &KANNALA_BRANDT_NAMES } else { &BROWN_CONRADY_NAMES };
+    let names = PLANE_NAMES.iter().chain(coefficients).enumerate();
+    let given = names.filter_map(|(ix, name)| sigma.get(name).map(|value| (ix, name, value)));
+    given
+        .map(|(ix, name, value)| match value.as_f64().filter(|value| *value >= 0.0) {
+            Some(value) => Ok((ix, value)),
+            None => Err(sigma.invalid(name, "expected a number of at least 0")),
+        })
+        .collect()
+}
+
+/// The matrix of a list. `None` if it is empty.
+pub(super) fn covariance_of(list: &[f64], intrinsics: &Intrinsics) -> Result<Option<DMatrix<f64>>, String> {
+    let n = intrinsics.params().len();
+    match list.len() {
+        0 => Ok(None),
+        n_given if n_given == n * n => Ok(Some(DMatrix::from_row_slice(n, n, list))),
+        n_given => Err(format!("{n_given} numbers, but the lens has {n} parameters: expected {} numbers", n * n)),
     }
 }
 

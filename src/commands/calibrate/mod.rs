@@ -7,6 +7,7 @@ mod intrinsics;
 mod json_object;
 mod lens;
 mod outputs;
+mod page;
 mod scan;
 mod scene;
 mod target;

@@ -1,10 +1,12 @@
 //! Files that `calibrate` writes: a rig file with the result, and a report.
 
 use crate::exit::{self, BadArgument, Exit};
+use crate::page_args::PageArgs;
 use calibration::hand_eye::{JointOffset, Setup};
 use capture::config::{Camera, Parent, Rig};
 use keyframe::listed;
 use kinematics::{Intrinsics, Transform};
+use nalgebra::DMatrix;
 use session::calibration_report::{self, Heading};
 use session::{Data, DataOptions, corrected_rig};
 use std::path::{Path, PathBuf};
@@ -29,6 +31,9 @@ pub(super) struct RigFlags {
     /// With a rig file: read the devices for S seconds [default: 30]
     #[arg(long, value_name = "S", value_parser = super::super::number_in_range(1.0..=3600.0))]
     pub(super) seconds: Option<f64>,
+    /// With a rig file: the page with the camera images and what to do next.
+    #[command(flatten)]
+    pub(super) page: PageArgs,
 }
 
 /// What a command calibrates from.
@@ -61,9 +66,10 @@ pub(super) fn is_rig_file(path: &Path) -> bool {
 impl RigFlags {
     /// Rejects flags that do not apply to the input.
     pub(super) fn check(&self, input: &Path) -> Result<(), BadArgument> {
+        self.page.check()?;
         let kind = InputKind::of(input);
-        let problem = if kind != InputKind::Rig && (self.sim || self.seconds.is_some()) {
-            "--sim and --seconds need a rig file (.toml) as input".to_owned()
+        let problem = if kind != InputKind::Rig && (self.sim || self.seconds.is_some() || self.page.is_given()) {
+            "--sim, --seconds and the flags of the page (--listen, --share) need a rig file (.toml) as input".to_owned()
         } else if kind == InputKind::Rig && self.rig.is_some() {
             format!("--rig: the input {} is a rig file, which is used; remove --rig", input.display())
         } else if kind != InputKind::Files {
@@ -144,8 +150,12 @@ impl RigOutput {
         Ok(corrected_rig::expect_size(corrected_rig::camera(&self.rig, &self.camera)?, size_px)?)
     }
 
-    pub(super) fn set_intrinsics(&mut self, intrinsics: &Intrinsics) -> anyhow::Result<()> {
-        self.rig = corrected_rig::with_intrinsics(&self.rig, &self.camera, intrinsics)?;
+    pub(super) fn set_intrinsics(
+        &mut self,
+        intrinsics: &Intrinsics,
+        covariance: Option<&DMatrix<f64>>,
+    ) -> anyhow::Result<()> {
+        self.rig = corrected_rig::with_intrinsics(&self.rig, &self.camera, intrinsics, covariance)?;
         Ok(())
     }
 

@@ -3,7 +3,9 @@
 
 use super::guide::{Guide, Purpose};
 use super::images::{self, DetectedImage, OtherSize};
+use super::lens::covariance_of;
 use super::outputs::{InputKind, RigFlags, RigOutput};
+use super::page::GuidancePage;
 use crate::exit::{BadArgument, InsufficientData};
 use crate::{print, signals};
 use calibration::BoardView;
@@ -13,8 +15,10 @@ use capture::open::{self, Devices, Opened};
 use capture::{ArmDuringImage, CalibrationImage, CalibrationImages, calibration_images};
 use drivers::Sample;
 use kinematics::{Chain, Intrinsics, Stamp, Transform};
+use nalgebra::DMatrix;
 use session::calibration_report::{Photo, Photos, Unused};
 use session::corrected_rig;
+use std::ops::ControlFlow;
 use std::path::Path;
 use targets::TargetSpec;
 
@@ -133,22 +137,26 @@ impl RigFlags {
         let is_live = !matches!(opened.stamp_clock, capture::StampClock::Unrelated);
         let template = if is_live { "{spinner} {msg}" } else { "{spinner} {pos} images" };
         let bar = print::bar(None, template, options.is_hidden);
-        let mut guide = is_live.then(|| Guide::new(target, camera, options.purpose, bar.clone()));
+        let page = is_live.then(|| GuidancePage::start(&self.page, camera)).transpose()?;
+        let mut guide = page.map(|page| Guide::new(target, camera, options.purpose, bar.clone(), page));
         let limit_secs = if is_live { self.seconds.unwrap_or(DEFAULT_SECS) } else { f64::INFINITY };
         let mut first: Option<Stamp> = None;
-        let is_end = |sample: &Sample| {
-            let since_first = sample.stamp().secs_since(*first.get_or_insert(sample.stamp()));
-            since_first > limit_secs || stop.requested()
-        };
-        let mut on_sample = |images: &[CalibrationImage]| {
+        let on_sample = |sample: &Sample, images: &[CalibrationImage]| {
             bar.set_position(images.len() as u64);
             if let Some(guide) = &mut guide {
-                guide.update(images);
+                guide.update(sample, images);
+            }
+            let since_first = sample.stamp().secs_since(*first.get_or_insert(sample.stamp()));
+            match since_first > limit_secs || stop.requested() {
+                true => ControlFlow::Break(()),
+                false => ControlFlow::Continue(()),
             }
         };
-        let found = calibration_images(opened, &camera.name, MAX_SHIFT_PX, is_end, &mut on_sample);
+        let found = calibration_images(opened, &camera.name, MAX_SHIFT_PX, on_sample);
         bar.finish_and_clear();
-        Ok((found?, guide.map(Guide::into_detected)))
+        let found = found?;
+        let detected = guide.map(|guide| guide.finish(&found.images));
+        Ok((found, detected))
     }
 }
 
@@ -219,6 +227,13 @@ impl Scan {
 
     pub(super) fn intrinsics(&self) -> &Intrinsics {
         &self.camera.intrinsics
+    }
+
+    /// Covariance of the intrinsics, if the rig file contains it.
+    pub(super) fn intrinsics_covariance(&self) -> Result<Option<DMatrix<f64>>, BadArgument> {
+        let Camera { name, intrinsics, intrinsics_covariance, .. } = &self.camera;
+        covariance_of(intrinsics_covariance, intrinsics)
+            .map_err(|error| BadArgument(format!("camera.{name}.intrinsics_covariance: {error}")))
     }
 
     /// The size of a board that the images show instead of that of the target.

@@ -1,14 +1,15 @@
-// One line across the view: why the picture is not live, or how the run ended.
+// One line across the view: why the picture is not live, what to do, or how the run ended.
 
 import { timeText } from "./chart";
 import type { ConnectionState } from "./connection";
 import { element } from "./element";
-import type { RunResult } from "./protocol";
+import type { Guidance, RunResult } from "./protocol";
 
 export class Banner {
   private connection: ConnectionState = "connecting";
   private connectionText = "";
   private result: RunResult | null = null;
+  private guidance: Guidance | null = null;
 
   setConnection(state: ConnectionState, text: string): void {
     this.connection = state;
@@ -18,7 +19,7 @@ export class Banner {
 
   /** Whether the run has ended, so that the server may stop. */
   get isFinished(): boolean {
-    return this.result !== null;
+    return this.result !== null || this.guidance?.is_finished === true;
   }
 
   setRunResult(result: RunResult | null): void {
@@ -26,15 +27,21 @@ export class Banner {
     this.show();
   }
 
+  setGuidance(guidance: Guidance | null): void {
+    this.guidance = guidance;
+    this.show();
+  }
+
   private show(): void {
     const isBroken = ["silent", "lost", "refused"].includes(this.connection);
     // Once a run has ended, a stopped server is expected.
-    const { result, isFinished } = this;
-    const text = result ? runResultText(result) : isBroken ? capitalized(this.connectionText) : "";
+    const { result, guidance, isFinished } = this;
+    const hasProblem = isBroken && !isFinished;
+    const text = result ? runResultText(result) : capitalized(hasProblem ? this.connectionText : (guidance?.text ?? ""));
     const banner = element("banner");
     if (banner.textContent !== text) banner.textContent = text; // Otherwise screen readers would repeat it.
-    banner.dataset.kind = isFinished ? "finished" : this.connection;
-    element("view").classList.toggle("stale", isBroken && !isFinished);
+    banner.dataset.kind = isFinished ? "finished" : hasProblem || !guidance ? this.connection : "guidance";
+    element("view").classList.toggle("stale", hasProblem);
   }
 }
 

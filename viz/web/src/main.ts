@@ -4,6 +4,7 @@ import { keepToken, showRole } from "./access";
 import { Banner } from "./banner";
 import { Connection } from "./connection";
 import { element } from "./element";
+import { showGuidance } from "./guidance";
 import { setUpHelp } from "./help";
 import { KeyframeList } from "./keyframe_list";
 import { LinkReadout } from "./link_readout";
@@ -81,6 +82,7 @@ function receiveText(message: TextMessage): void {
       showStatus(message);
       runControls.show(message);
       banner.setRunResult(message.result);
+      showGuidance(message.guidance, banner, subscriptions);
       break;
     case "scene":
       view.setScene(message);

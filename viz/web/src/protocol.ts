@@ -73,6 +73,13 @@ export interface Status extends ModelStatus {
   others: ModelStatus[];
   notes: string[];
   result: RunResult | null;
+  guidance?: Guidance;
+}
+
+/** What the operator should do, while images are taken for a calibration. */
+export interface Guidance {
+  text: string;
+  is_finished: boolean;
 }
 
 /** Result of a run that has ended. */

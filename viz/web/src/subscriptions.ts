@@ -19,7 +19,7 @@ const HIDDEN_STATUS_HZ = 0.5;
 /** Limits of the height of camera images, in CSS pixels: see `.live canvas` in app.css. */
 const IMAGE_HEIGHT = { min: 90, max: 190, ofWindow: 0.22 };
 const MAX_IMAGE_WIDTH_PX = 640;
-/** Maximum size of an enlarged image. */
+/** Maximum size of images that are enlarged or fill the view. */
 const ENLARGED_PX: [number, number] = [1280, 960];
 /** The server rounds image sizes down to multiples of this. */
 const IMAGE_STEP_PX = 16;
@@ -32,6 +32,7 @@ export class Subscriptions {
   private resizeTimer = 0;
   private showsPoints = false;
   private showsScans = true;
+  private showsLargeImages = false;
 
   private showsImages = true;
 
@@ -55,6 +56,12 @@ export class Subscriptions {
   /** Whether the points of keyframes are shown. */
   set points(shown: boolean) {
     this.showsPoints = shown;
+    this.update();
+  }
+
+  /** Whether the camera images fill the view. */
+  set largeImages(shown: boolean) {
+    this.showsLargeImages = shown;
     this.update();
   }
 
@@ -87,7 +94,7 @@ export class Subscriptions {
     const messages: SubscribeMessage[] = [
       { type: "subscribe", topic: "status", rate_hz: STATUS_HZ },
       { type: "subscribe", topic: "keyframes", rate_hz: KEYFRAMES_HZ },
-      { ...images, size_px: this.thumbnailPx() },
+      { ...images, size_px: this.showsLargeImages ? ENLARGED_PX : this.thumbnailPx() },
     ];
     for (const [camera, isEnlarged] of this.liveImages.resized) {
       messages.push({ ...images, camera, size_px: isEnlarged && this.showsImages ? ENLARGED_PX : this.thumbnailPx() });

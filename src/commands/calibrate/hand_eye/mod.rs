@@ -143,7 +143,7 @@ fn calibrate_and_print(
     if let Some(rig) = &mut rig {
         rig.set_extrinsics(calibration.setup, &calibration.parent_from_camera)?;
         match (&calibration.intrinsics, intrinsics) {
-            (Some((estimated, _)), _) => rig.set_intrinsics(estimated)?,
+            (Some((estimated, _)), _) => rig.set_intrinsics(estimated, None)?,
             (None, Some(given)) => rig.warn_if_intrinsics_differ(&given)?,
             (None, None) => (),
         }
@@ -267,11 +267,19 @@ impl Args {
         let symmetries: Vec<Transform> = source.target().map(TargetSpec::symmetry).unwrap_or_default();
         let chain = self.chain()?;
         let intrinsics = source.intrinsics(samples.size_px)?;
+        let covariance = match &intrinsics {
+            Some(intrinsics) if !self.with_intrinsics => source.intrinsics_covariance(intrinsics)?,
+            _ => None,
+        };
+        if intrinsics.is_some() && !self.with_intrinsics && covariance.is_none() {
+            log::info!("the given intrinsics are taken as exact, because their uncertainty is unknown");
+        }
         let intrinsics = if self.with_intrinsics { intrinsics.map(with_distortion) } else { intrinsics };
         let mut input = HandEyeInput {
             setup: source.setup(),
             samples: samples.used.clone(),
             intrinsics: intrinsics.clone(),
+            intrinsics_covariance: covariance,
             board_symmetries: &symmetries,
             chain: chain.as_ref().or(source.chain()),
             options: self.options(),

@@ -2,6 +2,7 @@
 
 use super::super::images::{self, DetectedImage};
 use super::super::outputs::{self, InputKind, RigFlags, RigOutput};
+use super::super::page::GuidancePage;
 use super::super::scan::Scan;
 use super::{next_pose_options, with_distortion};
 use crate::commands::move_arm;
@@ -131,7 +132,8 @@ impl MoveFlags {
             .into());
         }
         let given = Rig::load(request.input, &[])?;
-        let camera = flags.camera_of(&given)?.name.clone();
+        let given_camera = flags.camera_of(&given)?.clone();
+        let camera = &given_camera.name;
         if given.arm.driver == ArmDriver::None {
             return Err(BadArgument(format!("--move: {input}: the rig has no arm")).into());
         }
@@ -149,7 +151,8 @@ impl MoveFlags {
         }
         let stop = signals::stop_on_signals_logging("stopping the arm, then calibrating; Ctrl-C again exits at once")?;
         let devices = if flags.sim { Devices::Sim } else { Devices::Real };
-        let mut capture = ArmCapture::new(open::movable(&given, devices, &camera)?)?;
+        let page = GuidancePage::start(&flags.page, &given_camera)?;
+        let mut capture = ArmCapture::new(open::movable(&given, devices, camera)?)?;
         let rig = resolved(&given, capture.rig());
         if let Some(output) = output.filter(|_| !is_simulated) {
             output.set_rig(&rig);
@@ -163,9 +166,11 @@ impl MoveFlags {
             Parent::Flange | Parent::Base => camera.parent_from_camera,
         };
         let (found, photos) = (Vec::new(), Photos::new());
-        let mut images = Images { camera: &camera, base_or_flange_from_camera, request, found, photos };
+        let mut images = Images { camera: &camera, base_or_flange_from_camera, request, page, found, photos };
         let failure = self.take_images(&mut capture, &mut images, &stop).err();
-        let Images { found, photos, .. } = images;
+        let Images { page, found, photos, .. } = images;
+        page.finish();
+        drop(page);
         let holds_on_exit =
             is_simulated || given.arm.motion.as_ref().is_some_and(|motion| motion.on_loss == OnLoss::Hold);
         let mut arm = MovedArm { capture, stop, holds_on_exit, failure: None };
@@ -242,7 +247,9 @@ impl MoveFlags {
                     break;
                 }
             };
-            log::info!("moving to pose {}: {purpose}", images.found.len() + 1);
+            let motion = format!("moving to pose {}: {purpose}", images.found.len() + 1);
+            log::info!("{motion}");
+            images.page.guide(&motion);
             if !capture.move_to(&joints, stop)? {
                 return Ok(());
             }
@@ -256,6 +263,7 @@ impl MoveFlags {
             }
         }
         log::info!("returning to the start");
+        images.page.guide("returning to the start");
         capture.move_to(&start, stop)?;
         Ok(())
     }
@@ -278,6 +286,7 @@ struct Images<'a> {
     camera: &'a Camera,
     base_or_flange_from_camera: Transform,
     request: &'a Request<'a>,
+    page: GuidancePage,
     found: Vec<(DetectedImage, Option<ArmDuringImage>)>,
     photos: Photos,
 }
@@ -299,6 +308,7 @@ impl Images<'_> {
             ))),
             Err(reason) => Err(InsufficientData(format!("the target is not visible: {reason}"))),
         };
+        self.page.show_searched(size_px, &gray, board.as_ref().ok().map(|board| &board.view));
         if self.request.keeps_photos {
             self.photos.insert(name.clone(), Photo::Gray { size_px, pixels: gray });
         }
@@ -325,6 +335,7 @@ impl Images<'_> {
             setup: self.setup(),
             samples: self.found.iter().filter_map(sample).collect(),
             intrinsics: Some(self.camera.intrinsics.clone()),
+            intrinsics_covariance: None, // Further poses do not lower its effect.
             board_symmetries: symmetries,
             chain: Some(chain),
             options: ArmPlan::estimate_options(&self.request.options),

@@ -7,6 +7,7 @@ use super::super::{outputs, target_argument};
 use crate::exit::{BadArgument, InsufficientData};
 use calibration::hand_eye::{BoardObservation, HandEyeSample, Setup};
 use kinematics::{Intrinsics, Transform};
+use nalgebra::DMatrix;
 use serde_json::Value;
 use session::calibration_report::{Photos, Unused};
 use std::path::{Path, PathBuf};
@@ -97,6 +98,15 @@ impl SamplesFile {
     pub(super) fn intrinsics(&self, size_px: [u32; 2]) -> Result<Option<Intrinsics>, BadArgument> {
         let of_file = |error: BadArgument| BadArgument(format!("{}: {error}", self.path.display()));
         self.intrinsics.as_ref().map(|lens| lens.intrinsics(size_px).map_err(of_file)).transpose()
+    }
+
+    /// Covariance of the given intrinsics, if the file contains it.
+    pub(super) fn intrinsics_covariance(&self, intrinsics: &Intrinsics) -> Result<Option<DMatrix<f64>>, BadArgument> {
+        let of_file = |error: BadArgument| BadArgument(format!("{}: {error}", self.path.display()));
+        Ok(match &self.intrinsics {
+            Some(lens) => lens.covariance(intrinsics).map_err(of_file)?,
+            None => None,
+        })
     }
 
     fn has_images(&self) -> bool {

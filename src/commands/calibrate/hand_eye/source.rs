@@ -5,6 +5,7 @@ use super::samples_file::{Samples, SamplesFile};
 use crate::exit::InsufficientData;
 use calibration::hand_eye::Setup;
 use kinematics::{Chain, Intrinsics, Transform};
+use nalgebra::DMatrix;
 use targets::TargetSpec;
 
 /// Where the samples come from.
@@ -55,6 +56,14 @@ impl Source {
             (Self::File(file), Some(size_px)) => Ok(file.intrinsics(size_px)?),
             (Self::File(_), None) => Ok(None),
         }
+    }
+
+    /// Covariance of the given intrinsics, if it is known.
+    pub(super) fn intrinsics_covariance(&self, intrinsics: &Intrinsics) -> anyhow::Result<Option<DMatrix<f64>>> {
+        Ok(match self {
+            Self::Scan { scan, .. } => scan.intrinsics_covariance()?,
+            Self::File(file) => file.intrinsics_covariance(intrinsics)?,
+        })
     }
 
     /// Problems of the input that do not prevent a calibration.

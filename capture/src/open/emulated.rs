@@ -1,0 +1,77 @@
+//! Opens simulated cameras on an arm whose driver is not simulated: it connects to an emulated controller, whose motors
+//! move the simulated arm in real time.
+
+use super::real;
+use super::simulated::unlimited;
+use crate::config::{ArmDriver, Rig};
+use drivers::franka::FciVersion;
+use drivers::franka::emulated::{EmulatedRobot, Limits, RobotConfig};
+use drivers::motion::{JointTarget, Motion, MovableArm};
+use drivers::{Arm, Camera, Error, clock};
+use keyframe::bail;
+use kinematics::{JointState, Transform};
+use sim::MotorHistory;
+use sim::wire::{JointTrack, emulate_fci};
+use std::net::{Ipv4Addr, SocketAddr};
+use std::time::Duration;
+
+/// Opens the camera, and the arm for motion. The address of the arm becomes that of the controller.
+pub(super) fn open(rig: &mut Rig) -> crate::Result<(Box<dyn MovableArm>, Box<dyn Camera>)> {
+    if rig.arm.driver != ArmDriver::Franka {
+        bail!("sim.emulate_arm: only a controller of the driver \"franka\" can be emulated for a simulated camera");
+    }
+    let mut simulated = sim::open(&unlimited(rig)?)?;
+    let motors = MotorHistory::default();
+    let config = RobotConfig {
+        address: SocketAddr::from((Ipv4Addr::LOCALHOST, 0)),
+        // That of the Panda in the simulated scenes.
+        version: FciVersion::V5,
+        chain: real::franka_chain(rig)?,
+        flange_from_tool: Transform::identity(),
+        limits: Limits::panda(),
+    };
+    let track = JointTrack::at_rest(simulated.start_position()?).map_err(crate::Error::other)?;
+    let controller = emulate_fci(track, config, Some(motors.clone()))?;
+    rig.arm.address = controller.address().to_string();
+    log::info!("the arm is moved by an emulated Franka controller at {}", rig.arm.address);
+    let Some(camera) = simulated.into_motorized(motors, clock::now())?.into_iter().next() else {
+        bail!("the simulated rig has no camera");
+    };
+    let arm = Box::new(EmulatedArm { arm: real::movable_arm(rig)?, _controller: controller });
+    Ok((arm, camera))
+}
+
+/// A driver with the emulated controller that it is connected to.
+struct EmulatedArm {
+    /// Dropped first, while the controller still answers.
+    arm: Box<dyn MovableArm>,
+    _controller: EmulatedRobot,
+}
+
+impl Arm for EmulatedArm {
+    fn joint_names(&self) -> &[String] {
+        self.arm.joint_names()
+    }
+
+    fn read(&mut self, timeout: Duration) -> Result<JointState, Error> {
+        self.arm.read(timeout)
+    }
+}
+
+impl MovableArm for EmulatedArm {
+    fn command(&mut self, target: &JointTarget) -> Result<JointTarget, Error> {
+        self.arm.command(target)
+    }
+
+    fn motion(&self) -> Motion {
+        self.arm.motion()
+    }
+
+    fn stop(&mut self) -> Result<(), Error> {
+        self.arm.stop()
+    }
+
+    fn recover(&mut self) -> Result<(), Error> {
+        self.arm.recover()
+    }
+}

@@ -1,0 +1,78 @@
+//! Emulated motors that move the simulated arm in real time, instead of MuJoCo's dynamics.
+
+use crate::panda::Joints;
+use kinematics::{JointHistory, JointState, Stamp};
+use parking_lot::{Condvar, Mutex};
+use std::sync::Arc;
+use std::time::Duration;
+
+/// Positions are not interpolated across gaps longer than this, in which the emulator was stalled.
+const MAX_GAP: Duration = Duration::from_secs(1);
+/// Number of states kept: those of ten seconds at 1 kHz.
+const MAX_STATES: usize = 10_000;
+/// Maximum time to wait for a state. After it, the motors count as stopped.
+const MAX_WAIT: Duration = Duration::from_secs(2);
+
+/// Recent positions of emulated motors, in the order of the joint readings. Clones share them.
+#[derive(Clone, Debug)]
+pub struct MotorHistory(Arc<SharedStates>);
+
+#[derive(Debug)]
+struct SharedStates {
+    history: Mutex<JointHistory>,
+    arrived: Condvar,
+}
+
+impl Default for MotorHistory {
+    fn default() -> Self {
+        let history = Mutex::new(JointHistory::new(MAX_GAP, MAX_STATES));
+        Self(Arc::new(SharedStates { history, arrived: Condvar::new() }))
+    }
+}
+
+impl MotorHistory {
+    /// Adds the state of the motors. States that are not later than those before are ignored.
+    pub fn record(&self, state: JointState) {
+        let _ = self.0.history.lock().push(state); // Rejected states are counted by the history.
+        self.0.arrived.notify_all();
+    }
+
+    /// Waits until the positions at a stamp are known. Returns false if the motors have stopped.
+    fn wait_until(&self, stamp: Stamp) -> bool {
+        let mut history = self.0.history.lock();
+        while history.newest().is_none_or(|newest| newest < stamp) {
+            if self.0.arrived.wait_for(&mut history, MAX_WAIT).timed_out() {
+                return false;
+            }
+        }
+        true
+    }
+}
+
+/// An arm at the positions of emulated motors.
+pub(crate) struct MotorizedArm {
+    pub(crate) motors: MotorHistory,
+    /// Stamp of simulated time zero.
+    pub(crate) start: Stamp,
+    /// Joint index of each motor.
+    pub(crate) joint_ixs: Vec<usize>,
+    /// Added to the positions of the motors to get those of the joints; empty if there are none.
+    pub(crate) joint_offsets: Vec<f64>,
+}
+
+impl MotorizedArm {
+    /// Waits until the motors have reached a simulated time. Returns false if they have stopped.
+    pub(crate) fn wait_until(&self, nanos: i64) -> bool {
+        self.motors.wait_until(Stamp(self.start.0 + nanos))
+    }
+
+    /// Joint positions at a simulated time; `None` if the motors do not cover it.
+    pub(crate) fn position_at(&self, nanos: i64) -> Option<Joints> {
+        let state = self.motors.0.history.lock().at(Stamp(self.start.0 + nanos)).ok()?;
+        let mut position_rad = Joints::zeros();
+        for (value_ix, (joint_ix, position)) in self.joint_ixs.iter().zip(&state.position).enumerate() {
+            position_rad[*joint_ix] = position + self.joint_offsets.get(value_ix).copied().unwrap_or(0.0);
+        }
+        Some(position_rad)
+    }
+}

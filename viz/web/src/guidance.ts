@@ -1,0 +1,11 @@
+// While images are taken for a calibration, the page shows them in large, and what to do next.
+
+import type { Banner } from "./banner";
+import type { Guidance } from "./protocol";
+import type { Subscriptions } from "./subscriptions";
+
+export function showGuidance(guidance: Guidance | undefined, banner: Banner, subscriptions: Subscriptions): void {
+  document.body.classList.toggle("guided", guidance !== undefined);
+  banner.setGuidance(guidance ?? null);
+  subscriptions.largeImages = guidance !== undefined;
+}
