@@ -261,9 +261,7 @@ fn several_live_methods_equal_single_runs() {
     let args = ["run", "rig.toml", "--from", "scan.mcap", "--method", "tsdf,splat"];
     let common = ["--steps-per-keyframe", "1", "--out", "viewed", "--listen", "127.0.0.1:0", "--json"];
     let printed = interrupted(folder, &[&args[..], &common].concat(), |serving| {
-        let url = serving["url"].as_str().expect("an address");
-        request_picture_of_each_method(url);
-        pause_and_continue(url);
+        request_picture_of_each_method(serving["url"].as_str().expect("an address"));
     });
     assert_eq!(printed.iter().filter(|event| event["event"] == "done").count(), 2);
 }
@@ -285,35 +283,6 @@ fn interrupted(folder: &Path, args: &[&str], meanwhile: impl FnOnce(&Value)) -> 
     let printed = std::iter::from_fn(event).collect();
     assert_eq!(run.wait().expect("it ends").code(), Some(0));
     printed
-}
-
-/// Pauses training and continues it. Meanwhile, no model takes a step.
-fn pause_and_continue(url: &str) {
-    use std::time::{Duration, Instant};
-    let address = url.trim_start_matches("http://").trim_end_matches('/');
-    let stream = std::net::TcpStream::connect(address).expect("the server listens");
-    stream.set_read_timeout(Some(Duration::from_secs(60))).expect("a timeout");
-    let (mut socket, _) = tungstenite::client(format!("ws://{address}/ws"), stream).expect("a WebSocket");
-    let pause = |socket: &mut tungstenite::WebSocket<std::net::TcpStream>, is_paused: bool| {
-        let message = serde_json::json!({"type": "pause", "is_paused": is_paused});
-        socket.send(tungstenite::Message::text(message.to_string())).expect("sent");
-    };
-    let steps_in = |socket: &mut tungstenite::WebSocket<std::net::TcpStream>, state: &str| loop {
-        let tungstenite::Message::Text(text) = socket.read().expect("a status") else { continue };
-        let status: Value = serde_json::from_str(&text).expect("JSON");
-        if status["type"] == "status" && status["state"] == state {
-            return [&status, &status["others"][0]].map(|model| model["step"].as_u64().expect("a number"));
-        }
-    };
-    pause(&mut socket, true);
-    steps_in(&mut socket, "paused"); // Queued steps may still be counted.
-    let paused_at = steps_in(&mut socket, "paused");
-    let started = Instant::now();
-    while started.elapsed() < Duration::from_secs(1) {
-        assert_eq!(steps_in(&mut socket, "paused"), paused_at);
-    }
-    pause(&mut socket, false);
-    while steps_in(&mut socket, "training")[1] == paused_at[1] {}
 }
 
 /// Requests a picture of each model, and of a model that does not exist.
@@ -444,13 +413,44 @@ fn record_reports_losses_and_does_not_overwrite() {
     assert!(std::fs::read(folder.join("scan.mcap")).expect("a recording") == before);
 }
 
+/// Controls a run as an operator does: training stops, a checkpoint is written, and training continues.
+fn pause_save_and_resume(url: &str) {
+    let address = url.trim_start_matches("http://").trim_end_matches('/');
+    let stream = std::net::TcpStream::connect(address).expect("the server listens");
+    stream.set_read_timeout(Some(std::time::Duration::from_secs(60))).expect("a timeout");
+    let (mut socket, _) = tungstenite::client(format!("ws://{address}/ws"), stream).expect("a WebSocket");
+    let mut request = |action: &str, is_done: &dyn Fn(&Value) -> bool| -> Value {
+        let message = serde_json::json!({"type": "control", "action": action});
+        socket.send(tungstenite::Message::text(message.to_string())).expect("sent");
+        loop {
+            let tungstenite::Message::Text(text) = socket.read().expect("a message") else { continue };
+            let message: Value = serde_json::from_str(&text).expect("JSON");
+            if message["type"] == "status" && is_done(&message) {
+                return message;
+            }
+        }
+    };
+    let paused_at = number(&request("pause", &|status| status["state"] == "paused"), "step");
+    let is_saved = |status: &Value| status["notes"].to_string().contains("checkpoint taken after");
+    let saved_at = number(&request("save", &is_saved), "step");
+    assert_eq!(saved_at, paused_at, "no step while paused");
+    request("resume", &|status| status["state"] == "training" && number(status, "step") > paused_at);
+}
+
 #[test]
 fn interrupted_run_saves_model_and_recording() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
     rig_file(folder);
     let run = ["run", "rig.toml", "--sim", "--record", "scan.mcap", "--out", "cut"];
-    let printed = interrupted(folder, &[&run[..], &["--listen", "127.0.0.1:0", "--json"]].concat(), |_| {});
+    let printed = interrupted(folder, &[&run[..], &["--listen", "127.0.0.1:0", "--json"]].concat(), |serving| {
+        pause_save_and_resume(serving["url"].as_str().expect("an address"));
+        let began = std::time::Instant::now();
+        while !folder.join("cut/training.ckpt").is_file() {
+            assert!(began.elapsed().as_secs() < 60, "no checkpoint");
+            std::thread::sleep(std::time::Duration::from_millis(50));
+        }
+    });
     assert_eq!(printed.last().expect("events")["event"], "done");
     assert!(folder.join("cut/splats.ply").is_file());
     let replayed = fieldrig(folder, &["train", "scan.mcap", "--steps", "1", "--out", "again"]);

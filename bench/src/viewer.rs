@@ -1,6 +1,7 @@
 //! A viewer for benches: a WebSocket client that requests images back to back and discards them.
 //!
-//! It runs in the measured process. To affect the measurement little, it reads through one small buffer.
+//! It uses the capabilities that the web page uses for pictures. It runs in the measured process and decodes nothing, to
+//! affect the measurement little.
 
 use crate::Result;
 use keyframe::{ensure, failed};
@@ -23,8 +24,11 @@ const MAX_SILENCE: Duration = Duration::from_secs(120);
 const MAX_START: Duration = Duration::from_secs(2);
 /// Maximum length of a text message; the list of keyframes is the longest.
 const MAX_TEXT_BYTES: u64 = 16 << 20;
-/// Maximum length of the header of a binary message.
-const MAX_HEADER_BYTES: u64 = 64 << 10;
+/// Maximum length of a binary message; a panorama is the longest.
+const MAX_BINARY_BYTES: u64 = 256 << 20;
+
+/// Protocol version of this client.
+const PROTOCOL_VERSION: u32 = 4;
 
 const TEXT: u8 = 1;
 const BINARY: u8 = 2;
@@ -97,6 +101,7 @@ impl Viewer {
             first_stage: None,
             center_m: Point3::origin(),
             radius_m: 1.0,
+            parts: Vec::new(),
         };
         client.handshake(address)?;
         let thread = std::thread::Builder::new().name("viewer".into()).spawn(move || client.run());
@@ -146,6 +151,8 @@ struct Client {
     /// Center of the scene in world.
     center_m: Point3<f64>,
     radius_m: f64,
+    /// The parts received so far of a message that the server sends in parts.
+    parts: Vec<u8>,
 }
 
 impl Client {
@@ -166,6 +173,12 @@ impl Client {
     }
 
     fn run(mut self) -> Result<()> {
+        let hello = json!({
+            "type": "hello",
+            "protocols": [PROTOCOL_VERSION, PROTOCOL_VERSION],
+            "capabilities": ["subscribe", "compact_depth", "keyframe_changes", "parts"],
+        });
+        self.send(TEXT, hello.to_string().as_bytes())?;
         self.request_picture()?;
         loop {
             let (opcode, n_bytes) = self.next_frame()?;
@@ -208,12 +221,29 @@ impl Client {
     }
 
     fn handle_binary(&mut self, n_bytes: u64) -> Result<()> {
-        let mut length = [0; 4];
-        self.reader.read_exact(&mut length)?;
-        let n_header = u64::from(u32::from_le_bytes(length));
-        ensure!(n_header <= n_bytes.saturating_sub(4).min(MAX_HEADER_BYTES), "a header of {n_header} bytes");
-        let header: Value = serde_json::from_reader((&mut self.reader).take(n_header))?;
-        self.skip(n_bytes.saturating_sub(4 + n_header))?;
+        ensure!(
+            n_bytes <= MAX_BINARY_BYTES,
+            "a binary message of {n_bytes} bytes, expected at most {MAX_BINARY_BYTES}"
+        );
+        let mut message = Vec::new();
+        let n_read = (&mut self.reader).take(n_bytes).read_to_end(&mut message)?;
+        ensure!(n_read as u64 == n_bytes, "the server closed the connection within a message");
+        let (header, payload) = split(&message)?;
+        if header["type"] != "part" {
+            return self.handle_picture(&header);
+        }
+        if header["offset"] == 0 {
+            self.parts.clear();
+        }
+        self.parts.extend_from_slice(payload);
+        if header["bytes"] == self.parts.len() {
+            let header = split(&self.parts)?.0;
+            self.handle_picture(&header)?;
+        }
+        Ok(())
+    }
+
+    fn handle_picture(&mut self, header: &Value) -> Result<()> {
         // A picture of an earlier request may still arrive after an error.
         if header["type"] != "picture" || header["id"] != self.n_requested.saturating_sub(1) {
             return Ok(());
@@ -255,6 +285,7 @@ impl Client {
                 false => json!({ "kind": "pinhole", "vertical_fov_rad": 0.9 }),
             },
             "outputs": ["color", "depth"],
+            "depth_format": "compact_half",
         });
         self.n_requested += 1;
         (self.requested, self.first_stage) = (Instant::now(), None);
@@ -305,6 +336,16 @@ impl Client {
         frame.extend(contents);
         Ok(self.stream.write_all(&frame)?)
     }
+}
+
+/// Header and payload of a binary message.
+fn split(message: &[u8]) -> Result<(Value, &[u8])> {
+    let header = message
+        .split_first_chunk()
+        .and_then(|(length, rest)| rest.split_at_checked(usize::try_from(u32::from_le_bytes(*length)).ok()?));
+    let (header, payload) =
+        header.ok_or_else(|| failed!("a binary message of {} bytes without header", message.len()))?;
+    Ok((serde_json::from_slice(header)?, payload))
 }
 
 #[cfg(test)]

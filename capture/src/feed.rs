@@ -9,6 +9,7 @@ use crate::stations::Stations;
 use crate::stop::Stop;
 use drivers::recording::Recorder;
 use drivers::{PixelFormat, Sample, Source};
+use keyframe::RangePoints;
 use kinematics::{Stamp, Transform};
 use parking_lot::Mutex;
 use std::collections::{BTreeMap, HashMap, VecDeque};
@@ -58,6 +59,18 @@ pub trait InputObserver: Send {
 
     /// Receives a reading of the robot.
     fn observe_robot(&self, robot: ObservedRobot);
+
+    /// Receives a scan of a range scanner.
+    fn observe_range_scan(&self, scan: ObservedRangeScan);
+}
+
+/// A scan of a range scanner.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ObservedRangeScan {
+    /// The points, without the correction of their station.
+    pub scan: Arc<RangePoints>,
+    /// The correction of the station.
+    pub map_from_odom: Transform,
 }
 
 /// Joint positions and base pose of the robot at one time.
@@ -292,6 +305,7 @@ impl Pump {
                 JoinEvent::Accepted(keyframe) => self.apply(Change::Accepted(keyframe))?,
                 JoinEvent::Evicted { camera, stamp } => self.apply(Change::Evicted { camera, stamp })?,
                 JoinEvent::PosedImage(posed_image) => self.publish_image(&posed_image),
+                JoinEvent::RangeScan(scan) => self.publish_range_scan(scan),
                 JoinEvent::Rejected { why, .. } => {
                     *self.shared.rejected.lock().entry(why.name().to_owned()).or_default() += 1;
                 }
@@ -383,9 +397,16 @@ impl Pump {
             stamp: reading.stamp,
             captured_at: self.captured_at(reading.stamp),
             world_from_base: stations
-                .map_or(reading.world_from_base, |stations| stations.corrected_base(&reading.world_from_base)),
+                .map_or(reading.world_from_base, |stations| stations.map_from_odom() * reading.world_from_base),
             positions: reading.positions,
         });
+    }
+
+    /// Passes a range scan to the observer.
+    fn publish_range_scan(&self, scan: Arc<RangePoints>) {
+        let stations = self.input.stations.as_ref();
+        let map_from_odom = stations.map_or_else(Transform::identity, Stations::map_from_odom);
+        self.observer.observe_range_scan(ObservedRangeScan { scan, map_from_odom });
     }
 
     /// Time at which a sample was captured, or now if its stamp is on another clock (recordings, simulations).

@@ -54,7 +54,8 @@ pub use calibration_images::{ArmDuringImage, CalibrationImage, CalibrationImages
 pub use config::{ConfigError, Override, Rig};
 pub use error::{Error, Result};
 pub use feed::{
-    Feed, FeedItem, Input, InputObserver, InputResult, InputTimes, ObservedImage, ObservedPixels, ObservedRobot,
+    Feed, FeedItem, Input, InputObserver, InputResult, InputTimes, ObservedImage, ObservedPixels, ObservedRangeScan,
+    ObservedRobot,
 };
 pub use join::{Change, Counts, Join, JoinEvent, PosedImage, Rejection, SampleUse};
 pub use nearest_name::nearest_name;

@@ -179,9 +179,9 @@ impl Stations {
         if self.carried.contains(camera) { self.map_from_odom * world_from_camera } else { *world_from_camera }
     }
 
-    /// Applies the current correction to a reported base pose.
-    pub(crate) fn corrected_base(&self, world_from_base: &Transform) -> Transform {
-        self.map_from_odom * world_from_base
+    /// The current correction of reported base poses.
+    pub(crate) fn map_from_odom(&self) -> Transform {
+        self.map_from_odom
     }
 
     /// Reports on all stations after the first.

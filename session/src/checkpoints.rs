@@ -168,6 +168,11 @@ impl Checkpoints {
         Ok(false)
     }
 
+    /// Makes the next checkpoint due now.
+    pub fn request(&mut self) {
+        self.due_after = Duration::ZERO;
+    }
+
     /// Waits for the checkpoint in progress, then starts a checkpoint of the current state.
     pub fn begin(&mut self, now: Snapshot<'_>) -> Result<(), trainer::Error> {
         let job = self.take(now)?;

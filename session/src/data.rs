@@ -333,7 +333,7 @@ impl Data {
                     JoinEvent::Evicted { camera, stamp } => {
                         keyframes.retain(|keyframe| keyframe.camera != camera || keyframe.stamp != stamp);
                     }
-                    JoinEvent::PosedImage(_) | JoinEvent::Rejected { .. } => {}
+                    JoinEvent::PosedImage(_) | JoinEvent::RangeScan(_) | JoinEvent::Rejected { .. } => {}
                 }
             }
             progress(ReadProgress { noun: "keyframes", n_done: keyframes.len(), n_all: None });

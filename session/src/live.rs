@@ -11,7 +11,7 @@ use keyframe::{Keyframe, Split};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use trainer::{AlignTiming, QueuedPicture};
-use viz::{Hub, KeyframePose, ModelStatus, PendingRender, Status};
+use viz::{Control, Hub, KeyframePose, ModelStatus, PendingRender, Status};
 
 /// Minimum number of keyframes that determine the first view of the scene.
 const HINT_KEYFRAMES: usize = 5;
@@ -75,6 +75,10 @@ pub struct Live {
     /// Times of the keyframes of the first session.
     ledger: Ledger,
     keyframe_change: Option<KeyframeChange>,
+    /// Whether an operator has paused training.
+    is_paused: bool,
+    /// Result of the last checkpoint that an operator requested.
+    checkpoint_note: Option<String>,
 }
 
 /// Changes a keyframe before the models receive it.
@@ -103,6 +107,8 @@ impl Live {
             recoveries: Recoveries::new(options.open_gpu),
             ledger: Ledger::default(),
             keyframe_change: None,
+            is_paused: false,
+            checkpoint_note: None,
         }
     }
 
@@ -202,8 +208,12 @@ impl Live {
 
     /// Runs one cycle: takes keyframes, trains, draws and publishes. Reopens the GPU if it fails.
     pub fn advance(&mut self) -> crate::Result<()> {
-        let advanced =
-            self.take_keyframes().and_then(|()| self.step()).and_then(|()| self.render()).and_then(|()| self.publish());
+        let advanced = self
+            .apply_controls()
+            .and_then(|()| self.take_keyframes())
+            .and_then(|()| self.step())
+            .and_then(|()| self.render())
+            .and_then(|()| self.publish());
         advanced.or_else(|error| self.recoveries.recover(&mut self.sessions, error))
     }
 
@@ -220,14 +230,34 @@ impl Live {
         recoveries::describe_recoverable(&mut self.sessions)
     }
 
+    /// Applies the actions that operators have requested. An evaluation is completed first.
+    fn apply_controls(&mut self) -> crate::Result<()> {
+        if self.is_scoring() {
+            return Ok(());
+        }
+        for control in self.hub.take_controls() {
+            match control {
+                Control::Pause => self.is_paused = true,
+                Control::Resume => self.is_paused = false,
+                Control::Save => {
+                    let mut is_written = true;
+                    for session in &mut self.sessions {
+                        is_written &= session.save_checkpoint()?;
+                    }
+                    self.checkpoint_note = Some(match is_written {
+                        true => format!("checkpoint taken after {:.0} s", self.sessions[0].secs()),
+                        false => "this run writes no checkpoints".to_owned(),
+                    });
+                }
+            }
+        }
+        Ok(())
+    }
+
     /// Pushes new keyframes to the models: all waiting keyframes in real time, or the keyframe that is due in lockstep.
     /// Does nothing during an evaluation.
     fn take_keyframes(&mut self) -> crate::Result<()> {
         if self.is_scoring() {
-            return Ok(());
-        }
-        if self.hub.is_paused() && self.pace != Pace::RealTime {
-            self.hub.wait_for_request(IDLE); // The next keyframe is due at a later step.
             return Ok(());
         }
         self.apply_alignments()?;
@@ -237,7 +267,7 @@ impl Live {
         let n_before = self.keyframes.len();
         match self.pace {
             Pace::RealTime => {
-                if !self.is_training() || self.is_idle() {
+                if !self.is_training() || self.is_idle() || self.is_paused {
                     let first = self.wait_for_change();
                     first.map_or(Ok(()), |item| self.apply(item))?;
                 }
@@ -303,7 +333,7 @@ impl Live {
             self.budget.add_training(before.elapsed());
             return Ok(());
         }
-        if self.is_finished() || self.hub.is_paused() {
+        if self.is_finished() || self.is_paused {
             self.hub.wait_for_request(IDLE);
             return Ok(());
         }
@@ -338,7 +368,7 @@ impl Live {
     /// Draws requested pictures as long as training keeps its share of the time.
     fn render(&mut self) -> crate::Result<()> {
         let started = Instant::now();
-        if !self.is_training() || self.is_idle() || self.hub.is_paused() {
+        if !self.is_training() || self.is_idle() || self.is_paused {
             self.budget.refill(); // Training is idle, so drawing does not delay it.
         }
         while started.elapsed() < MAX_RENDER_TIME
@@ -378,7 +408,7 @@ impl Live {
     /// Queues steps behind pictures, which keeps the GPU busy while the pictures are delivered. Only for a single model in
     /// real time, where this needs no other work.
     fn queue_steps(&mut self) -> crate::Result<()> {
-        let is_training = self.is_training() && !self.is_idle() && !self.is_scoring() && !self.hub.is_paused();
+        let is_training = self.is_training() && !self.is_idle() && !self.is_scoring() && !self.is_paused;
         let (Pace::RealTime, [session], true) = (self.pace, &mut self.sessions[..], is_training) else { return Ok(()) };
         if !session.is_over() {
             session.train_steps(u64::MAX)?;
@@ -449,8 +479,13 @@ impl Live {
             rejected: self.feed.rejected(),
             model: models.next().unwrap_or_default(),
             others: models.collect(),
-            notes: [self.notes.clone(), self.device_notes.list(), movements.iter().map(ToString::to_string).collect()]
-                .concat(),
+            notes: [
+                self.notes.clone(),
+                self.device_notes.list(),
+                movements.iter().map(ToString::to_string).collect(),
+                self.checkpoint_note.iter().cloned().collect(),
+            ]
+            .concat(),
             result: None,
         });
         Ok(())
@@ -497,7 +532,7 @@ impl Live {
     fn state(&self) -> &'static str {
         if self.is_finished() {
             "finished"
-        } else if self.hub.is_paused() {
+        } else if self.is_paused {
             "paused"
         } else if self.is_training() {
             "training"

@@ -401,6 +401,13 @@ impl Session {
         Ok(())
     }
 
+    /// Writes a checkpoint now, if none is being written. Returns false if the run writes no checkpoints.
+    pub fn save_checkpoint(&mut self) -> crate::Result<bool> {
+        let is_requested = self.persistence.request_checkpoint();
+        self.evaluate_when_due()?;
+        Ok(is_requested)
+    }
+
     /// Writes a checkpoint if one is due, and evaluates if an evaluation is due. A finished session does neither.
     pub fn evaluate_when_due(&mut self) -> crate::Result<()> {
         if self.time.is_finished() {

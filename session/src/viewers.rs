@@ -1,7 +1,7 @@
-//! Passes camera images and the motion of the robot to viewers.
+//! Passes camera images, the motion of the robot and range scans to viewers.
 
-use capture::{InputObserver, ObservedImage, ObservedPixels, ObservedRobot};
-use viz::{Hub, LiveImage, LivePixels, RobotState};
+use capture::{InputObserver, ObservedImage, ObservedPixels, ObservedRangeScan, ObservedRobot};
+use viz::{Hub, LiveImage, LivePixels, RangeScan, RobotState};
 
 /// An observer of a run's input that passes it to the clients of a hub.
 pub struct Viewers(pub Hub);
@@ -38,5 +38,9 @@ impl InputObserver for Viewers {
             world_from_base: robot.world_from_base,
             positions: robot.positions,
         });
+    }
+
+    fn observe_range_scan(&self, observed: ObservedRangeScan) {
+        self.0.set_range_scan(RangeScan { scan: observed.scan, map_from_odom: observed.map_from_odom });
     }
 }

@@ -2,10 +2,11 @@
 
 use crate::Hub;
 use crate::clock::ServerClock;
-use crate::hub::{Demand, LiveImages};
+use crate::hub::{Demand, LiveImages, RangeScans};
 use crate::keyframe_log::KeyframeLog;
 use crate::keyframe_points::pack_points;
 use crate::picture::pack_live_image;
+use crate::range_scan::pack_range_scan;
 use crate::robot::RobotMessage;
 use crate::server_message::{KeyframeMessage, ServerMessage};
 use crate::subscriptions::fitted;
@@ -21,6 +22,8 @@ use tokio::task::JoinSet;
 const CHECK_PERIOD: Duration = Duration::from_millis(20);
 /// Minimum period between status messages.
 const STATUS_PERIOD: Duration = Duration::from_millis(100);
+/// Minimum period between versions of the base path.
+const BASE_PATH_PERIOD: Duration = Duration::from_millis(500);
 /// Minimum period between versions of the keyframe list.
 const KEYFRAMES_PERIOD: Duration = Duration::from_millis(200);
 /// Maximum number of images of a camera that are encoded at the same time. Clients may want many different sizes.
@@ -39,6 +42,9 @@ pub(crate) struct LatestMessages {
     /// The source of changes of the list; `None` before the first list.
     pub(crate) keyframe_log: Option<Arc<KeyframeLog>>,
     pub(crate) live_images: BTreeMap<ImageKey, Item>,
+    pub(crate) base_path: Option<Item>,
+    /// Scans by scanner, if a client shows them.
+    pub(crate) range_scans: BTreeMap<Arc<str>, Item>,
     /// Points of keyframes by number, if a client draws them; `None` for keyframes without points.
     pub(crate) keyframe_points: BTreeMap<u64, Option<Message>>,
 }
@@ -61,6 +67,8 @@ impl LatestMessages {
             && self.keyframe_list.is_none()
             && self.keyframe_log.is_none()
             && self.live_images.is_empty()
+            && self.base_path.is_none()
+            && self.range_scans.is_empty()
             && self.keyframe_points.is_empty()
     }
 }
@@ -83,12 +91,16 @@ struct ImageEncoding {
 pub(crate) async fn broadcast(hub: Hub, clock: ServerClock, latest_messages_sender: watch::Sender<LatestMessages>) {
     let (mut scene, mut status, mut robot, mut keyframes, live_images) =
         (hub.scene(), hub.status(), hub.robot(), hub.keyframes(), hub.live_images());
+    let (mut base_path, mut range_scans) = (hub.base_path(), hub.range_scans());
     // A client may connect before the first check, and it has not received what was set earlier.
     scene.mark_changed();
     status.mark_changed();
     robot.mark_changed();
+    base_path.mark_changed();
+    range_scans.mark_changed();
     keyframes.mark_changed();
     let mut status_sent = Throttle::new(STATUS_PERIOD);
+    let mut base_path_sent = Throttle::new(BASE_PATH_PERIOD);
     let mut keyframes_sent = Throttle::new(KEYFRAMES_PERIOD);
     let mut list_sent = Throttle::new(KEYFRAME_LIST_PERIOD);
     let mut keyframe_log = KeyframeLog::default();
@@ -98,6 +110,7 @@ pub(crate) async fn broadcast(hub: Hub, clock: ServerClock, latest_messages_send
     let mut points_encoding: Option<(tokio::task::Id, u64)> = None;
     let mut image_encodings: BTreeMap<ImageKey, ImageEncoding> = BTreeMap::new();
     let mut encodings: JoinSet<Encoded> = JoinSet::new();
+    let mut packed_scans = RangeScans::new();
     let mut n_items = 0;
     let mut publish_item = |change: &dyn Fn(&mut LatestMessages, u64)| {
         n_items += 1;
@@ -152,10 +165,14 @@ pub(crate) async fn broadcast(hub: Hub, clock: ServerClock, latest_messages_send
             scene.mark_changed();
             status.mark_changed();
             robot.mark_changed();
+            base_path.mark_changed();
+            range_scans.mark_changed();
             keyframes.mark_changed();
             is_list_outdated = true;
             image_encodings.retain(|_, image_encoding| image_encoding.is_running);
+            packed_scans.clear();
             status_sent.reset();
+            base_path_sent.reset();
             keyframes_sent.reset();
             list_sent.reset();
             continue;
@@ -182,6 +199,28 @@ pub(crate) async fn broadcast(hub: Hub, clock: ServerClock, latest_messages_send
             publish_item(&|latest_messages, number| {
                 latest_messages.status = Some(Item { number, message: message.clone() });
             });
+        }
+        if base_path_sent.is_due()
+            && let Some(path) = take_if_changed(&mut base_path)
+        {
+            base_path_sent.begin();
+            let message = text(&ServerMessage::BasePath { points_m: path.rounded() });
+            publish_item(&|latest_messages, number| {
+                latest_messages.base_path = Some(Item { number, message: message.clone() });
+            });
+        }
+        let needs_scans = demands.iter().any(|demand| demand.subscriptions.range_scans.is_some());
+        if needs_scans && let Some(scans) = take_if_changed(&mut range_scans) {
+            for (scanner, scan) in scans {
+                let known = packed_scans.insert(Arc::clone(&scanner), Arc::clone(&scan));
+                let is_new = known.is_none_or(|known| !Arc::ptr_eq(&known, &scan));
+                let Some(message) = is_new.then(|| pack_range_scan(&scan)).flatten().map(Message::binary) else {
+                    continue;
+                };
+                publish_item(&|latest_messages, number| {
+                    latest_messages.range_scans.insert(Arc::clone(&scanner), Item { number, message: message.clone() });
+                });
+            }
         }
         if keyframes_sent.is_due()
             && let Some(list) = take_if_changed(&mut keyframes)

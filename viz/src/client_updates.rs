@@ -21,6 +21,8 @@ pub(crate) struct ClientUpdates {
     /// Number of the subscription to keyframes that the list belongs to.
     n_keyframe_lists: u64,
     live_images: BTreeMap<Arc<str>, Sent>,
+    base_path: Sent,
+    range_scans: BTreeMap<Arc<str>, Sent>,
     /// Whether the last long message was a live image.
     was_image: bool,
     /// Numbers of the keyframes whose points were sent, and the time of the last ones.
@@ -87,6 +89,7 @@ impl ClientUpdates {
             for is_image in [!self.was_image, self.was_image] {
                 let message = if is_image {
                     self.next_image(latest, subscriptions, &mut timer)
+                        .or_else(|| self.next_scan(latest, subscriptions, &mut timer))
                 } else if has_keyframe_changes {
                     self.next_changes(latest, subscriptions, &mut timer)
                         .or_else(|| self.next_points(latest, subscriptions, &mut timer))
@@ -123,6 +126,13 @@ impl ClientUpdates {
             self.status = Sent { number: item.number, at: Some(timer.now) };
             return Some(item.message.clone());
         }
+        if let (Some(period), Some(item)) = (subscriptions.base_path, &latest.base_path)
+            && item.number > self.base_path.number
+            && timer.is_due(self.base_path.at, period)
+        {
+            self.base_path = Sent { number: item.number, at: Some(timer.now) };
+            return Some(item.message.clone());
+        }
         subscriptions.robot_state.and_then(|_| newer(latest.robot.as_ref(), &mut self.robot))
     }
 
@@ -155,6 +165,23 @@ impl ClientUpdates {
         });
         let (_, camera, item) = waiting.min_by_key(|(number, ..)| *number)?;
         self.live_images.insert(Arc::clone(camera), Sent { number: item.number, at: Some(timer.now) });
+        Some(item.message.clone())
+    }
+
+    /// The scan of the scanner whose last scan was sent longest ago.
+    fn next_scan(
+        &mut self,
+        latest: &LatestMessages,
+        subscriptions: &Subscriptions,
+        timer: &mut Timer,
+    ) -> Option<Message> {
+        let period = subscriptions.range_scans?;
+        let waiting = latest.range_scans.iter().filter_map(|(scanner, item)| {
+            let sent = self.range_scans.get(scanner).copied().unwrap_or_default();
+            (item.number > sent.number && timer.is_due(sent.at, period)).then_some((sent.number, scanner, item))
+        });
+        let (_, scanner, item) = waiting.min_by_key(|(number, ..)| *number)?;
+        self.range_scans.insert(Arc::clone(scanner), Sent { number: item.number, at: Some(timer.now) });
         Some(item.message.clone())
     }
 

@@ -1,9 +1,11 @@
 //! Shared state of the training thread and the server. The training thread never waits for a client.
 
+use crate::base_path::BasePath;
 use crate::picture::packing;
 use crate::pose::row_major;
-use crate::protocol::ProjectionMessage;
+use crate::protocol::{Control, ProjectionMessage};
 use crate::queue::{Outgoing, Queue, RenderJob};
+use crate::range_scan::RangeScan;
 use crate::robot::{RobotDescription, RobotState};
 use crate::server_message::PictureHeader;
 use crate::subscriptions::Subscriptions;
@@ -28,12 +30,17 @@ pub struct Hub {
 /// Latest images by camera name.
 pub(crate) type LiveImages = BTreeMap<Arc<str>, Arc<LiveImage>>;
 
+/// Latest scans by scanner name.
+pub(crate) type RangeScans = BTreeMap<Arc<str>, Arc<RangeScan>>;
+
 /// Keyframes by camera and stamp.
 type KeyframeSources = BTreeMap<(Arc<str>, i64), Weak<Keyframe>>;
 
 /// A client gets keyframes and images this long after it has joined, or after its hello. Earlier, it is not known which
 /// of them it wants, and at which size.
 const HELLO_GRACE: Duration = Duration::from_millis(500);
+/// Maximum time between two positions on the path of the base.
+const PATH_PERIOD: Duration = Duration::from_millis(100);
 
 /// What a client receives.
 #[derive(Clone, Debug)]
@@ -70,14 +77,18 @@ struct Shared {
     keyframe_sources: Mutex<KeyframeSources>,
     robot: watch::Sender<Option<Arc<RobotDescription>>>,
     robot_state: watch::Sender<Option<Arc<RobotState>>>,
+    base_path: watch::Sender<BasePath>,
+    /// When the path was extended last.
+    path_extended: Mutex<Option<Instant>>,
+    range_scans: watch::Sender<RangeScans>,
     /// Requirements of the connected clients.
     demands: Mutex<BTreeMap<u64, Demand>>,
     /// For each camera: transform `reported_from_corrected`.
     camera_corrections: Mutex<BTreeMap<Arc<str>, Transform>>,
-    /// Whether an operator has paused training.
-    is_paused: AtomicBool,
     /// Whether somebody besides the clients needs images and robot states.
     is_observed: AtomicBool,
+    /// Actions that the run has not taken yet, without repetitions.
+    controls: Mutex<Vec<Control>>,
     queue: Mutex<Queue>,
     work_arrived: Condvar,
 }
@@ -149,16 +160,9 @@ impl Hub {
 
     /// Sets the current state of the robot.
     pub fn set_robot_state(&self, state: RobotState) {
+        *self.shared.path_extended.lock() = Some(Instant::now());
+        self.shared.base_path.send_if_modified(|path| path.push(state.world_from_base.translation.vector.into()));
         self.shared.robot_state.send_replace(Some(Arc::new(state)));
-    }
-
-    /// Whether an operator has paused training.
-    pub fn is_paused(&self) -> bool {
-        self.shared.is_paused.load(Ordering::Relaxed)
-    }
-
-    pub(crate) fn set_paused(&self, is_paused: bool) {
-        self.shared.is_paused.store(is_paused, Ordering::Relaxed);
     }
 
     /// Sets whether somebody besides the clients needs images and robot states.
@@ -176,10 +180,20 @@ impl Hub {
         self.is_observed() || self.shared.demands.lock().values().any(|demand| demand.subscriptions.has_live_images())
     }
 
-    /// Whether a client draws the robot.
+    /// Whether a client draws the robot, or the path of its base is due.
     pub fn needs_robot_state(&self) -> bool {
-        self.is_observed()
+        let is_path_due = self.shared.path_extended.lock().is_none_or(|at| at.elapsed() >= PATH_PERIOD);
+        is_path_due
+            || self.is_observed()
             || self.shared.demands.lock().values().any(|demand| demand.subscriptions.robot_state.is_some())
+    }
+
+    /// Sets the latest scan of a range scanner. It is encoded later, on another thread, and only for clients that show
+    /// it.
+    pub fn set_range_scan(&self, range_scan: RangeScan) {
+        self.shared.range_scans.send_modify(|scans| {
+            scans.insert(Arc::clone(&range_scan.scan.scanner), Arc::new(range_scan));
+        });
     }
 
     /// Sets the keyframes of which clients can draw points. They are not kept alive.
@@ -192,6 +206,18 @@ impl Hub {
     /// The keyframe with this camera and stamp, if the run still has it.
     pub(crate) fn keyframe_source(&self, camera: &Arc<str>, stamp: Stamp) -> Option<Arc<Keyframe>> {
         self.shared.keyframe_sources.lock().get(&(Arc::clone(camera), stamp.0))?.upgrade()
+    }
+
+    /// The actions that operators have requested since the last call, in order.
+    pub fn take_controls(&self) -> Vec<Control> {
+        std::mem::take(&mut *self.shared.controls.lock())
+    }
+
+    /// Requests an action of the run.
+    pub(crate) fn control(&self, action: Control) {
+        let mut controls = self.shared.controls.lock();
+        controls.retain(|earlier| *earlier != action);
+        controls.push(action);
     }
 
     /// Number of connected clients.
@@ -278,6 +304,14 @@ impl Hub {
 
     pub(crate) fn robot_state(&self) -> watch::Receiver<Option<Arc<RobotState>>> {
         self.shared.robot_state.subscribe()
+    }
+
+    pub(crate) fn base_path(&self) -> watch::Receiver<BasePath> {
+        self.shared.base_path.subscribe()
+    }
+
+    pub(crate) fn range_scans(&self) -> watch::Receiver<RangeScans> {
+        self.shared.range_scans.subscribe()
     }
 
     pub(crate) fn live_images(&self) -> watch::Receiver<LiveImages> {

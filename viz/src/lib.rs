@@ -14,6 +14,7 @@
 
 mod access;
 mod admission;
+mod base_path;
 mod broadcast;
 mod certificate;
 mod client_updates;
@@ -35,6 +36,7 @@ mod picture;
 mod pose;
 mod protocol;
 mod queue;
+mod range_scan;
 mod robot;
 mod server;
 mod server_context;
@@ -52,7 +54,8 @@ pub use error::Error;
 #[cfg(feature = "foxglove")]
 pub use foxglove_server::FoxgloveServer;
 pub use hub::{Hub, PendingRender};
-pub use protocol::{BASE_PROTOCOL_VERSION, PROTOCOL_VERSION};
+pub use protocol::{BASE_PROTOCOL_VERSION, Control, PROTOCOL_VERSION};
+pub use range_scan::RangeScan;
 pub use robot::{MeshFormat, RobotDescription, RobotMesh, RobotState};
 pub use server::{Server, ServerConfig, Sharing};
 pub use updates::{KeyframePose, LiveImage, LivePixels, ModelStatus, RunResult, SceneHint, Status};

@@ -1,5 +1,6 @@
 //! Estimates how fast a client's connection transfers data, so that little of it waits in buffers.
 
+use crate::compact_depth::Effort;
 use std::time::Duration;
 
 /// Data handed to the kernel at once, and data in the kernel's buffer, as transfer times. Together they stay below
@@ -11,6 +12,8 @@ const PART_BYTES: std::ops::RangeInclusive<f64> = 4096.0..=65_536.0;
 const BUFFER_BYTES: std::ops::RangeInclusive<f64> = 8192.0..=65_536.0;
 /// Rate before the first measurement: an ordinary wireless link.
 const INITIAL_BYTES_PER_SEC: f64 = 1.25e6;
+/// Above this rate, fast compression saves more time than its additional bytes take.
+const FAST_BYTES_PER_SEC: f64 = 6e6;
 /// Shorter sends do not measure the link, but the memory of this computer.
 const MIN_SEND_SECS: f64 = 2e-4;
 /// Parts of less than half the usual size measure the link only if they take at least this long. Otherwise, the time
@@ -60,6 +63,11 @@ impl LinkRate {
         }
     }
 
+    /// How to compress data for this connection.
+    pub(crate) fn effort(self) -> Effort {
+        if self.bytes_per_sec > FAST_BYTES_PER_SEC { Effort::Fast } else { Effort::Small }
+    }
+
     /// Size of the parts of long messages.
     pub(crate) fn part_bytes(self) -> usize {
         bytes_in(self.bytes_per_sec * PART_TIME, PART_BYTES)
@@ -78,7 +86,7 @@ fn bytes_in(bytes: f64, range: std::ops::RangeInclusive<f64>) -> usize {
 
 #[cfg(test)]
 mod tests {
-    use super::LinkRate;
+    use super::{Effort, LinkRate};
     use std::time::Duration;
 
     /// Simulates a link with a kernel buffer. Returns the largest time that data waits once the estimate has settled.
@@ -117,6 +125,7 @@ mod tests {
             rate.observe(rate.part_bytes(), Duration::from_micros(20), Duration::ZERO);
         }
         assert_eq!((rate.part_bytes(), rate.buffer_bytes()), (65_536, 65_536));
+        assert_eq!((rate.effort(), LinkRate::default().effort()), (Effort::Fast, Effort::Small));
         // The short ends of messages do not look like a slow link.
         for _ in 0..40 {
             rate.observe(300, Duration::from_micros(250), Duration::ZERO);

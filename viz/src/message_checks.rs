@@ -17,7 +17,7 @@ pub(crate) fn check_session(session: &str) {
             Ok(ClientMessage::Hello(hello)) => check_hello(&hello),
             Ok(ClientMessage::Render(message)) => check_render(&message),
             Ok(ClientMessage::Subscribe(message)) => check_subscription(&mut subscriptions, message),
-            Ok(ClientMessage::Pause(_) | ClientMessage::Ping(_) | ClientMessage::Goodbye(_)) | Err(_) => {}
+            Ok(ClientMessage::Control(_) | ClientMessage::Ping(_) | ClientMessage::Goodbye(_)) | Err(_) => {}
         }
     }
 }
@@ -53,8 +53,8 @@ fn check_subscription(subscriptions: &mut Subscriptions, message: SubscribeMessa
         return;
     }
     let images = subscriptions.images_of(&camera);
-    let Subscriptions { status, keyframes, robot_state, keyframe_points, .. } = *subscriptions;
-    let periods = [status, keyframes, robot_state, keyframe_points, images.period];
+    let Subscriptions { status, keyframes, robot_state, keyframe_points, range_scans, base_path, .. } = *subscriptions;
+    let periods = [status, keyframes, robot_state, keyframe_points, range_scans, base_path, images.period];
     assert!(periods.into_iter().flatten().all(|period| period.as_secs_f64() >= 0.999 / MAX_RATE_HZ));
     for size_px in [[640, 480], [1, 4000], [4096, 1]] {
         let fitted = fitted(size_px, images.max_px);

@@ -1,7 +1,7 @@
 //! Packs pictures and live images into binary messages.
 
 use crate::clock::ServerClock;
-use crate::compact_depth::compress;
+use crate::compact_depth::{Effort, compress};
 use crate::jpeg::{Chroma, JpegError, Layout, Pixels, downscale, encode, n_threads};
 use crate::protocol::DepthFormat;
 use crate::server_message::{BinaryHeader, ColorPart, DepthPart, LiveHeader, PictureHeader, frame};
@@ -47,6 +47,7 @@ pub(crate) fn pack_picture(
     view_request: &ViewRequest,
     mut header: PictureHeader,
     rendered: &Rendered,
+    effort: Effort,
 ) -> Result<Vec<u8>, PackError> {
     let began = Instant::now();
     let encoded;
@@ -63,7 +64,7 @@ pub(crate) fn pack_picture(
     let depth_bytes = match depth.zip(view_request.depth) {
         None => &[][..],
         Some((packed, format @ DepthFormat::CompactHalf)) => {
-            compact = compress(packed)?;
+            compact = compress(packed, effort)?;
             header.depth = Some(DepthPart {
                 format,
                 size_px: compact.size_px,

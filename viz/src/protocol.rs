@@ -29,8 +29,8 @@ pub(crate) enum ClientMessage {
     Render(Box<RenderMessage>),
     /// Sets how often a topic is sent, and at which size.
     Subscribe(SubscribeMessage),
-    /// Pauses or continues training.
-    Pause(PauseMessage),
+    /// Controls the run.
+    Control(ControlMessage),
     /// Requests the server's time.
     Ping(ClientPing),
     /// The client disconnects.
@@ -42,7 +42,7 @@ impl ClientMessage {
     pub(crate) fn required_role(&self) -> Role {
         match self {
             Self::Hello(_) | Self::Render(_) | Self::Subscribe(_) | Self::Ping(_) | Self::Goodbye(_) => Role::Viewer,
-            Self::Pause(_) => Role::Operator,
+            Self::Control(_) => Role::Operator,
         }
     }
 }
@@ -73,6 +73,10 @@ pub(crate) enum Topic {
     RobotState,
     /// Points of each keyframe.
     KeyframePoints,
+    /// Scans of range scanners.
+    RangeScans,
+    /// The path of a moving base.
+    BasePath,
 }
 
 /// Fields of `subscribe`.
@@ -89,12 +93,24 @@ pub(crate) struct SubscribeMessage {
     pub(crate) size_px: Option<[u32; 2]>,
 }
 
-/// Fields of `pause`.
+/// Fields of `control`.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(crate) struct PauseMessage {
-    /// Whether training pauses.
-    pub(crate) is_paused: bool,
+pub(crate) struct ControlMessage {
+    /// What the run should do.
+    pub(crate) action: Control,
+}
+
+/// An action of an operator.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Control {
+    /// Stops training; keyframes are still accepted.
+    Pause,
+    /// Continues training.
+    Resume,
+    /// Writes a checkpoint.
+    Save,
 }
 
 /// Fields of `ping`.

@@ -38,6 +38,8 @@ pub(crate) enum ServerMessage<'a> {
     Robot(&'a RobotMessage<'a>),
     /// Joint positions and base pose of the robot.
     RobotState(RobotStateMessage),
+    /// Positions of a moving base so far.
+    BasePath { points_m: Vec<[f64; 3]> },
     /// Reason why a message was invalid or a picture failed.
     Error {
         id: Option<u64>,
@@ -111,6 +113,8 @@ pub(crate) enum BinaryHeader<'a> {
     LiveImage(&'a LiveHeader<'a>),
     /// Points of a keyframe.
     KeyframePoints(PointsHeader),
+    /// A scan of a range scanner.
+    RangeScan(RangeScanHeader<'a>),
     /// A part of a binary message.
     Part(PartHeader),
 }
@@ -119,6 +123,16 @@ pub(crate) enum BinaryHeader<'a> {
 #[derive(Clone, Copy, Debug, Serialize)]
 pub(crate) struct PointsHeader {
     pub(crate) id: u64,
+    pub(crate) n_points: usize,
+    pub(crate) meters_per_count: f64,
+}
+
+/// Header of `range_scan`.
+#[derive(Clone, Copy, Debug, Serialize)]
+pub(crate) struct RangeScanHeader<'a> {
+    pub(crate) scanner: &'a str,
+    pub(crate) stamp_nanos: i64,
+    pub(crate) origin_m: [f64; 3],
     pub(crate) n_points: usize,
     pub(crate) meters_per_count: f64,
 }

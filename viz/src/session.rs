@@ -6,7 +6,7 @@ use crate::admission::Connection;
 use crate::hub::Demand;
 use crate::link_rate::LinkRate;
 use crate::negotiation::{Negotiated, negotiate};
-use crate::protocol::{ClientMessage, PauseMessage, SubscribeMessage};
+use crate::protocol::{ClientMessage, ControlMessage, SubscribeMessage};
 use crate::queue::MAX_VIEWS;
 use crate::server_context::ServerContext;
 use crate::view_request::{InvalidRequest, ViewRequest};
@@ -142,9 +142,9 @@ impl Reader<'_> {
                 self.subscribe(message)?;
                 None
             }
-            ClientMessage::Pause(PauseMessage { is_paused }) => {
-                log::info!("client {} {} training", self.client, if is_paused { "paused" } else { "continued" });
-                self.hub.set_paused(is_paused);
+            ClientMessage::Control(ControlMessage { action }) => {
+                log::info!("client {} requested {action:?}", self.client);
+                self.hub.control(action);
                 None
             }
             ClientMessage::Ping(ping) => Some(Reply::Pong { t: ping.t }),

@@ -33,6 +33,10 @@ pub(crate) struct Subscriptions {
     pub(crate) keyframe_points: Option<Duration>,
     /// Number of subscriptions to points so far. Each of them begins with the points of all keyframes.
     pub(crate) n_point_subscriptions: u64,
+    /// Minimum time between two scans of a range scanner; `None` if not sent.
+    pub(crate) range_scans: Option<Duration>,
+    /// The same for the path of the base.
+    pub(crate) base_path: Option<Duration>,
     /// Images of cameras without a subscription of their own.
     live_images: ImageSubscription,
     /// Images of single cameras.
@@ -57,6 +61,8 @@ impl Default for Subscriptions {
             robot_state: None,
             keyframe_points: None,
             n_point_subscriptions: 0,
+            range_scans: None,
+            base_path: None,
             live_images: ImageSubscription { period: Some(Duration::from_millis(190)), max_px: DEFAULT_IMAGE_PX },
             cameras: BTreeMap::new(),
         }
@@ -89,6 +95,8 @@ impl Subscriptions {
                 self.keyframe_points = period;
                 self.n_point_subscriptions += 1;
             }
+            Topic::RangeScans => self.range_scans = period,
+            Topic::BasePath => self.base_path = period,
             Topic::LiveImages => {
                 let rounded = |size_px: [u32; 2]| size_px.map(|side| side / MIN_IMAGE_PX * MIN_IMAGE_PX);
                 let images = ImageSubscription { period, max_px: size_px.map_or(DEFAULT_IMAGE_PX, rounded) };

@@ -7,6 +7,7 @@
 use crate::access::Role;
 use crate::admission::Connection;
 use crate::client_updates::{ClientUpdates, Next};
+use crate::compact_depth::Effort;
 use crate::hub::Demand;
 use crate::link_rate::LinkRate;
 use crate::negotiation::{Agreement, CAPABILITIES, Negotiated};
@@ -118,7 +119,7 @@ impl Writer<'_> {
                 && let Some(outgoing) = self.server_context.hub.collect(self.client)
             {
                 match outgoing {
-                    Outgoing::Picture(rendered) => encoding = Some(encode(rendered)),
+                    Outgoing::Picture(rendered) => encoding = Some(encode(rendered, self.link.effort())),
                     Outgoing::Failed { id, view, reason } => {
                         let sent = self.send_error(Some(id), &view, &reason).await;
                         self.server_context.hub.release(self.client);
@@ -304,12 +305,12 @@ impl Writer<'_> {
     }
 }
 
-fn encode(rendered: Box<(RenderJob, PictureHeader, Rendered)>) -> EncodingTask {
+fn encode(rendered: Box<(RenderJob, PictureHeader, Rendered)>, effort: Effort) -> EncodingTask {
     let view_request = &rendered.0.view_request;
     let (id, view) = (view_request.id, Arc::clone(&view_request.view));
     let task = tokio::task::spawn_blocking(move || {
         let (job, header, picture) = *rendered;
-        pack_picture(&job.view_request, header, &picture)
+        pack_picture(&job.view_request, header, &picture, effort)
     });
     EncodingTask { id, view, task }
 }

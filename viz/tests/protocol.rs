@@ -8,6 +8,7 @@ mod robot;
 
 use analytic_scene::draw;
 use client::{Client, Received};
+use keyframe::RangePoints;
 use kinematics::{Stamp, Transform};
 use nalgebra::{Translation3, Vector3};
 use serde_json::{Value, json};
@@ -16,8 +17,8 @@ use std::net::{SocketAddr, TcpListener, TcpStream};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use viz::{
-    Error, Hub, KeyframePose, LiveImage, LivePixels, ModelStatus, PendingRender, SceneHint, Server, ServerConfig,
-    Status,
+    Control, Error, Hub, KeyframePose, LiveImage, LivePixels, ModelStatus, PendingRender, RangeScan, SceneHint, Server,
+    ServerConfig, Status,
 };
 
 /// Far more than loopback needs. A test that waits this long fails.
@@ -273,6 +274,19 @@ fn malformed_message_gets_error_and_connection_stays() {
 }
 
 #[test]
+fn actions_of_operators_reach_the_run_once() {
+    let (hub, server) = start();
+    let mut client = Client::connect(server.address());
+    for action in ["pause", "pause", "save"] {
+        client.send_json(&json!({"type": "control", "action": action}));
+    }
+    client.send_json(&json!({"type": "control", "action": "explode"}));
+    assert!(client.text_of("error")["message"].as_str().expect("text").contains("explode"));
+    assert_eq!(hub.take_controls(), [Control::Pause, Control::Save]);
+    assert_eq!(hub.take_controls(), []);
+}
+
+#[test]
 fn failed_render_sends_error_message() {
     let (hub, server) = start();
     let mut client = Client::connect(server.address());
@@ -360,6 +374,10 @@ fn one_of_each() -> Vec<Value> {
     client.send_json(&json!({"type": "subscribe", "topic": "robot_state", "rate_hz": 60}));
     hub.set_robot_state(robot::state(0.1));
     messages.push(client.text_of("robot_state"));
+    client.send_json(&json!({"type": "subscribe", "topic": "base_path", "rate_hz": 2}));
+    client.send_json(&json!({"type": "subscribe", "topic": "range_scans", "rate_hz": 10}));
+    hub.set_range_scan(range_scan());
+    messages.extend([client.text_of("base_path"), client.binary_of("range_scan").0]);
     client.send_json(&json!({"type": "ping", "t": 1.0}));
     messages.push(client.text_of("pong"));
     hub.set_live_image(LiveImage {
@@ -381,6 +399,18 @@ fn one_of_each() -> Vec<Value> {
     drop(server);
     messages.push(client.text_of("goodbye"));
     messages
+}
+
+fn range_scan() -> RangeScan {
+    RangeScan {
+        scan: Arc::new(RangePoints {
+            scanner: "lidar".into(),
+            stamp: Stamp(1),
+            world_from_scanner: Transform::identity(),
+            points_in_world_m: [[1.0, 2.0, 3.0]].into(),
+        }),
+        map_from_odom: Transform::identity(),
+    }
 }
 
 /// The part of the docs about a message from the server.

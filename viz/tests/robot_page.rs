@@ -4,6 +4,7 @@
 //! Skipped, with a message, if Chromium or the bundle (`make web`) is missing.
 
 mod analytic_scene;
+#[expect(dead_code, reason = "another test measures tasks")]
 mod browser;
 mod robot;
 

@@ -8,7 +8,7 @@ use std::net::{SocketAddr, TcpStream};
 use std::time::{Duration, Instant};
 use tungstenite::client::IntoClientRequest;
 use tungstenite::{Message, WebSocket};
-use viz::{Certificate, Hub, Server, ServerConfig, Sharing, Tokens};
+use viz::{Certificate, Control, Hub, Server, ServerConfig, Sharing, Tokens};
 
 /// Far more than loopback needs. A test that waits this long fails.
 const TIMEOUT: Duration = Duration::from_secs(20);
@@ -168,17 +168,17 @@ fn only_operators_change_the_run() {
     let shared = Shared::start();
     let mut viewer = shared.client(&shared.viewer);
     assert_eq!(viewer.text_of("hello")["role"], json!("viewer"));
-    viewer.send(&json!({"type": "pause", "is_paused": true}));
+    viewer.send(&json!({"type": "control", "action": "pause"}));
     let refusal = viewer.text_of("error")["message"].clone();
     assert!(refusal.as_str().is_some_and(|text| text.contains("requires the role operator")), "{refusal}");
-    assert!(!shared.hub.is_paused());
+    assert_eq!(shared.hub.take_controls(), []);
 
     let mut operator = shared.client(&shared.operator);
     assert_eq!(operator.text_of("hello")["role"], json!("operator"));
-    for is_paused in [true, false] {
-        operator.send(&json!({"type": "pause", "is_paused": is_paused}));
+    for (name, action) in [("pause", Control::Pause), ("resume", Control::Resume), ("save", Control::Save)] {
+        operator.send(&json!({"type": "control", "action": name}));
         assert!(operator.is_answered(), "the message before was read");
-        assert_eq!(shared.hub.is_paused(), is_paused);
+        assert_eq!(shared.hub.take_controls(), [action]);
     }
     assert!(viewer.is_answered(), "a refused message does not end the connection");
 }

@@ -11,7 +11,7 @@ use std::io::{Read, Write};
 use std::net::TcpListener;
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
-use viz::{Certificate, Hub, Server, ServerConfig, Sharing, Status, Tokens};
+use viz::{Certificate, Control, Hub, Server, ServerConfig, Sharing, Status, Tokens};
 
 const WINDOW_PX: [u32; 2] = [1280, 760];
 const PHONE_PX: [u32; 2] = [390, 844];
@@ -60,7 +60,9 @@ fn page_uses_its_token_and_shows_its_role() {
     assert_eq!(browser.text("banner"), "");
     assert_eq!(browser.text("role"), "viewer");
     let pause = "document.getElementById('pause')";
-    wait_for(&mut browser, "the button", |browser| browser.evaluate(&format!("{pause}.hidden")) == json!(false));
+    let has_controls =
+        |browser: &mut Browser| browser.evaluate("document.getElementById('controls').hidden") == json!(false);
+    wait_for(&mut browser, "the buttons", has_controls);
     assert_eq!(browser.evaluate(&format!("{pause}.disabled")), json!(true));
     let reason = browser.evaluate(&format!("{pause}.title"));
     assert!(reason.as_str().is_some_and(|reason| reason.contains("connected as viewer")), "{reason}");
@@ -76,14 +78,12 @@ fn page_uses_its_token_and_shows_its_role() {
     browser.call("Page.reload", json!({}));
     wait_for(&mut browser, "a connection", connected);
     wait_for(&mut browser, "the role", |browser| browser.text("role").is_empty());
-    wait_for(&mut browser, "the button", |browser| browser.evaluate(&format!("{pause}.hidden")) == json!(false));
-    for (state, is_paused) in [("paused", true), ("training", false)] {
+    wait_for(&mut browser, "the buttons", has_controls);
+    for (action, state, label) in [(Control::Pause, "paused", "Continue"), (Control::Resume, "training", "Pause")] {
         browser.click("pause");
-        wait_for(&mut browser, "the pause", |_| hub.is_paused() == is_paused);
+        wait_for(&mut browser, "the request", |_| hub.take_controls().contains(&action));
         hub.set_state(state); // As the run does.
-        wait_for(&mut browser, "the state", |browser| {
-            browser.evaluate(&format!("{pause}.getAttribute('aria-pressed')")) == json!(is_paused.to_string())
-        });
+        wait_for(&mut browser, "the state", |browser| browser.text("pause") == label);
     }
     std::fs::write(scratch.join("shared-operator.png"), browser.screenshot()).expect("written");
     drop(browser);

@@ -74,6 +74,8 @@ pub enum JoinEvent {
     },
     /// A color image with a known pose, whether or not it becomes a keyframe.
     PosedImage(PosedImage),
+    /// A range scan with known base poses.
+    RangeScan(Arc<RangePoints>),
     /// A color image did not become a keyframe.
     Rejected {
         /// The reason.
@@ -274,6 +276,7 @@ impl Join {
         let counts_placed = self.ranges.process_ready(&self.motion, self.newest, at_end, self.max_wait_secs);
         self.counts.range_scans += counts_placed.n_placed;
         self.counts.range_scans_rejected += counts_placed.n_rejected;
+        events.extend(self.ranges.newest(counts_placed.n_placed).cloned().map(JoinEvent::RangeScan));
         for camera_ix in 0..self.cameras.len() {
             while let Some(ready) = self.next_ready(camera_ix, at_end) {
                 match ready {

@@ -45,6 +45,12 @@ impl RangeScans {
         self.kept.iter()
     }
 
+    /// The newest `n` transformed scans, oldest first; fewer if fewer are kept.
+    pub(super) fn newest(&self, n: u64) -> impl Iterator<Item = &Arc<RangePoints>> {
+        let n_skipped = self.kept.len().saturating_sub(usize::try_from(n).unwrap_or(usize::MAX));
+        self.kept.iter().skip(n_skipped)
+    }
+
     /// Depth of a keyframe from the scans around its stamp; `None` if they cover too little of the image.
     ///
     /// A cell of [`CELL_PX`] pixels per side takes its nearest point, because points on more distant surfaces also

@@ -103,6 +103,11 @@ impl Persistence {
         }
     }
 
+    /// Makes the next checkpoint due now. Returns false if the run writes no checkpoints.
+    pub(super) fn request_checkpoint(&mut self) -> bool {
+        self.checkpoints.as_mut().map(Checkpoints::request).is_some()
+    }
+
     /// Starts a checkpoint if one is due.
     pub(super) fn write_checkpoint_when_due(&mut self, snapshot: Snapshot<'_>) -> crate::Result<()> {
         let Some(checkpoints) = &mut self.checkpoints else { return Ok(()) };

@@ -29,7 +29,18 @@ pub(crate) fn chromium() -> Option<PathBuf> {
 
 impl Browser {
     /// Opens a page of this size in CSS pixels; the profile folder must be empty.
-    pub(crate) fn open(program: &Path, profile: &Path, url: &str, [width, height]: [u32; 2]) -> Self {
+    pub(crate) fn open(program: &Path, profile: &Path, url: &str, size_px: [u32; 2]) -> Self {
+        Self::open_with(program, profile, url, size_px, "")
+    }
+
+    /// [`Browser::open`]; runs a script before the page's own scripts.
+    pub(crate) fn open_with(
+        program: &Path,
+        profile: &Path,
+        url: &str,
+        [width, height]: [u32; 2],
+        script: &str,
+    ) -> Self {
         let mut process = Command::new(program)
             .args(["--headless", "--no-sandbox", "--disable-quic", "--no-first-run", "--ignore-certificate-errors"])
             .args(["--disable-background-networking", "--disable-component-update", "--disable-sync"])
@@ -59,6 +70,8 @@ impl Browser {
         let attached = browser.call("Target.attachToTarget", json!({"targetId": target["targetId"], "flatten": true}));
         browser.session = attached["sessionId"].as_str().expect("a session").to_owned();
         browser.resize([width, height]);
+        browser.call("Page.enable", json!({}));
+        browser.call("Page.addScriptToEvaluateOnNewDocument", json!({"source": script}));
         browser.call("Page.navigate", json!({"url": url}));
         browser
     }
@@ -115,6 +128,33 @@ impl Browser {
     pub(crate) fn mouse(&mut self, kind: &str, [x, y]: [i32; 2]) {
         let event = json!({"type": kind, "x": x, "y": y, "button": "left", "buttons": 1, "clickCount": 1});
         self.call("Input.dispatchMouseEvent", event);
+    }
+
+    /// Durations of the tasks of the page's main thread within this time, milliseconds.
+    pub(crate) fn trace_tasks(&mut self, duration: Duration) -> Vec<f64> {
+        let session = std::mem::take(&mut self.session); // Tracing belongs to the browser, not to the page.
+        self.call("Tracing.start", json!({"traceConfig": {"includedCategories": ["toplevel"]}}));
+        std::thread::sleep(duration);
+        self.call("Tracing.end", json!({}));
+        let mut events: Vec<Value> = Vec::new();
+        loop {
+            let Message::Text(text) = self.socket.read().expect("chromium answers") else { continue };
+            let mut message: Value = serde_json::from_str(&text).expect("JSON");
+            match message["method"].as_str() {
+                Some("Tracing.dataCollected") => {
+                    events.extend(message["params"]["value"].as_array_mut().expect("events").drain(..));
+                }
+                Some("Tracing.tracingComplete") => break,
+                _ => {}
+            }
+        }
+        self.session = session;
+        let is_main = |event: &&Value| event["name"] == "thread_name" && event["args"]["name"] == "CrRendererMain";
+        let main_threads: Vec<_> = events.iter().filter(is_main).map(|event| (&event["pid"], &event["tid"])).collect();
+        let is_task = |event: &&Value| {
+            event["name"] == "ThreadControllerImpl::RunTask" && main_threads.contains(&(&event["pid"], &event["tid"]))
+        };
+        events.iter().filter(is_task).filter_map(|event| Some(event["dur"].as_f64()? * 1e-3)).collect()
     }
 
     /// Screenshot of the page as PNG.

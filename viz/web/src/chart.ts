@@ -1,10 +1,13 @@
-// Accuracy over time as a line on a canvas.
+// Accuracy of all models over time on a canvas; the selected model is highlighted.
 
 const MARGIN = { left: 30, right: 8, top: 8, bottom: 18 };
 const MIN_SPAN_DB = 2;
 
+export type Curve = [seconds: number, psnr: number][];
+
 export class Chart {
-  private points: [number, number][] = [];
+  private points: Curve = [];
+  private others: Curve[] = [];
   private hovered: number | null = null;
 
   constructor(private readonly canvas: HTMLCanvasElement) {
@@ -19,8 +22,9 @@ export class Chart {
     });
   }
 
-  set(points: [number, number][]): void {
-    this.points = points.filter(([x, y]) => Number.isFinite(x) && Number.isFinite(y));
+  set(points: Curve, others: Curve[]): void {
+    this.points = finite(points);
+    this.others = others.map(finite).filter((curve) => curve.length > 0);
     this.draw();
   }
 
@@ -42,8 +46,9 @@ export class Chart {
       context.fillText("after the first evaluation", width / 2, height / 2);
       return;
     }
-    const xMax = Math.max(1, this.points[this.points.length - 1]![0]);
-    const [yMin, yMax] = spanOf(this.points.map((point) => point[1]));
+    const all = [this.points, ...this.others];
+    const xMax = Math.max(1, ...all.map((curve) => curve[curve.length - 1]![0]));
+    const [yMin, yMax] = spanOf(all.flat().map((point) => point[1]));
     const x = (value: number): number => MARGIN.left + (value / xMax) * (width - MARGIN.left - MARGIN.right);
     const y = (value: number): number =>
       height - MARGIN.bottom - ((value - yMin) / (yMax - yMin)) * (height - MARGIN.top - MARGIN.bottom);
@@ -63,10 +68,13 @@ export class Chart {
       context.fillText(timeText(tick), x(tick), height - 4);
     }
 
-    const path = this.points.map(([seconds, psnr]) => [x(seconds), y(psnr)] as const);
+    const pathOf = (curve: Curve) => curve.map(([seconds, psnr]) => [x(seconds), y(psnr)] as const);
+    context.lineJoin = "round";
+    context.strokeStyle = color("--dim");
+    for (const other of this.others) line(context, pathOf(other));
+    const path = pathOf(this.points);
     context.strokeStyle = color("--accent");
     context.lineWidth = 1.75;
-    context.lineJoin = "round";
     line(context, path);
     const selected = this.nearest(x) ?? this.points.length - 1;
     this.mark(context, path[selected]!, this.points[selected]!, color);
@@ -86,7 +94,7 @@ export class Chart {
   private mark(
     context: CanvasRenderingContext2D,
     [px, py]: readonly [number, number],
-    [seconds, psnr]: [number, number],
+    [seconds, psnr]: Curve[number],
     color: (name: string) => string,
   ): void {
     context.fillStyle = color("--accent");
@@ -104,6 +112,10 @@ export class Chart {
     context.textAlign = "center";
     context.fillText(text, middle, above);
   }
+}
+
+function finite(curve: Curve): Curve {
+  return curve.filter(([seconds, psnr]) => Number.isFinite(seconds) && Number.isFinite(psnr));
 }
 
 function line(context: CanvasRenderingContext2D, points: readonly (readonly [number, number])[]): void {

@@ -5,7 +5,7 @@ import { element } from "./element";
 export function setUpHelp(): void {
   const dialog = element("help", HTMLDialogElement);
   const show = (): void => {
-    const rows = [...document.querySelectorAll<HTMLButtonElement>(".toolbar button")].flatMap((button) => {
+    const rows = [...document.querySelectorAll<HTMLButtonElement>(".toolbar button, .layers button")].flatMap((button) => {
       const match = /^(.*?) \((.)\)(.*)$/.exec(button.title);
       return match && !button.hidden ? [row(match[2]!, match[1]! + match[3]!)] : [];
     });

@@ -1,4 +1,4 @@
-// The current camera images, as thumbnails in the corner.
+// The current camera images, as thumbnails in the corner. A click on an image enlarges it.
 
 import { element } from "./element";
 import type { LiveImageHeader } from "./protocol";
@@ -20,9 +20,14 @@ interface Slot {
 }
 
 export class LiveImages {
+  /** Cameras whose image has been enlarged, and whether it still is. */
+  readonly resized = new Map<string, boolean>();
   private readonly slots = new Map<string, Slot>();
 
-  constructor(private readonly clock: () => ServerClock) {
+  constructor(
+    private readonly clock: () => ServerClock,
+    private readonly onResize: () => void,
+  ) {
     window.setInterval(() => this.showAges(), 100);
   }
 
@@ -68,6 +73,11 @@ export class LiveImages {
     caption.append(name, age);
     figure.append(canvas, caption);
     figure.dataset.camera = camera;
+    figure.addEventListener("click", () => {
+      const isEnlarged = figure.classList.toggle("enlarged");
+      this.resized.set(camera, isEnlarged);
+      this.onResize();
+    });
     element("live").append(figure);
     const slot: Slot = { figure, canvas, caption, age, capturedMillis: -Infinity, waiting: null, isDecoding: false };
     this.slots.set(camera, slot);

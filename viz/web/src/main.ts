@@ -10,12 +10,14 @@ import { LinkReadout } from "./link_readout";
 import { LiveImages } from "./live_images";
 import { ModelSwitch } from "./model_switch";
 import { BACKGROUND, OrbitView } from "./orbit_view";
-import { PauseButton } from "./pause_button";
+import { panels } from "./panels";
 import type { BinaryHeader, LiveImageHeader, PictureHeader, Status, TextMessage } from "./protocol";
 import { Readouts } from "./readouts";
 import { RenderScheduler } from "./render_scheduler";
 import { RobotAge } from "./robot_age";
+import { RunControls } from "./run_controls";
 import { Subscriptions } from "./subscriptions";
+import { ViewSettings } from "./view_settings";
 
 let stages = [0.1, 0.5, 1];
 let latestStatus: Status | null = null;
@@ -44,6 +46,7 @@ const connection = new Connection(`${location.protocol === "https:" ? "wss" : "w
       robotAge.forget();
       scheduler.restart();
       view.points.clear();
+      view.scans.clear();
       subscriptions.restart();
       element("toggle-points").hidden = !connection.supports("keyframe_points");
     }
@@ -52,17 +55,19 @@ const connection = new Connection(`${location.protocol === "https:" ? "wss" : "w
   text: receiveText,
   binary: receiveBinary,
 });
-const liveImages = new LiveImages(() => connection.clock);
+const liveImages = new LiveImages(() => connection.clock, () => subscriptions.update());
 const robotAge = new RobotAge(view.robot, connection.clock);
-const subscriptions = new Subscriptions(connection);
+const subscriptions = new Subscriptions(connection, liveImages);
 const keyframes = new KeyframeList();
+const runControls = new RunControls(connection);
 new LinkReadout(connection);
-const pauseButton = new PauseButton(connection);
 const models = new ModelSwitch(() => {
   scheduler.restart();
   if (latestStatus) showStatus(latestStatus);
 });
 const scheduler = new RenderScheduler(connection, () => view.view(), () => stages, BACKGROUND, () => models.method);
+
+const settings = new ViewSettings(view, scheduler);
 
 function receiveText(message: TextMessage): void {
   switch (message.type) {
@@ -74,6 +79,7 @@ function receiveText(message: TextMessage): void {
       latestStatus = message;
       models.list(message);
       showStatus(message);
+      runControls.show(message);
       banner.setRunResult(message.result);
       break;
     case "scene":
@@ -99,6 +105,10 @@ function receiveText(message: TextMessage): void {
       robotAge.received(message);
       view.follow();
       break;
+    case "base_path":
+      view.scans.setPath(message.points_m);
+      view.changed();
+      break;
     case "error":
       scheduler.failed(message.id);
       element("notice").textContent = message.message;
@@ -114,7 +124,6 @@ function receiveText(message: TextMessage): void {
 function showStatus(status: Status): void {
   const model = models.shown(status);
   readouts.show(status, model);
-  pauseButton.show(status);
   if (model.step !== latestStep) scheduler.modelChanged();
   latestStep = model.step;
 }
@@ -122,6 +131,10 @@ function showStatus(status: Status): void {
 function receiveBinary(header: BinaryHeader, payload: Uint8Array<ArrayBuffer>): void {
   if (header.type === "picture") {
     void showPicture(header, payload);
+  } else if (header.type === "range_scan") {
+    view.scans.show(header, payload);
+    element("toggle-scans").hidden = false;
+    view.changed();
   } else if (header.type === "keyframe_points") {
     view.points.add(header, payload);
     view.changed();
@@ -170,6 +183,7 @@ function action(id: string, key: string, act: () => void): void {
   element(id).addEventListener("click", act);
   window.addEventListener("keydown", (event) => {
     const isPlain = !event.ctrlKey && !event.metaKey && !event.altKey && !event.repeat;
+    if (event.target instanceof HTMLInputElement || event.target instanceof HTMLSelectElement) return;
     if (isPlain && event.key.toLowerCase() === key) act();
   });
 }
@@ -191,15 +205,28 @@ toggle("toggle-model", "m", (isOn) => (view.picture.enabled = isOn));
 toggle("toggle-grid", "g", (isOn) => (view.overlays.showsGround = isOn));
 toggle("toggle-keyframes", "k", (isOn) => (view.overlays.showsKeyframes = isOn));
 toggle("toggle-crop", "x", (isOn) => (view.crop.enabled = isOn));
+toggle("toggle-measure", "d", (isOn) => (view.measure.enabled = isOn));
+toggle("toggle-images", "i", (isOn) => {
+  element("live").hidden = !isOn;
+  subscriptions.images = isOn;
+});
+const togglePanel = panels({ "toggle-layers": "layers", "toggle-settings": "settings" });
+action("toggle-layers", "e", () => togglePanel("toggle-layers"));
+action("toggle-settings", "v", () => togglePanel("toggle-settings"));
 toggle("toggle-follow", "l", (isOn) => (view.follows = isOn));
 toggle("toggle-points", "p", (isOn) => {
   view.points.enabled = isOn;
   subscriptions.points = isOn;
 });
+toggle("toggle-scans", "s", (isOn) => {
+  view.scans.enabled = isOn;
+  subscriptions.scans = isOn;
+});
 toggle("toggle-robot", "b", (isOn) => (view.robot.enabled = isOn));
 toggle("toggle-occlude", "o", (isOn) => (view.occlusion.enabled = isOn));
 
 function frame(): void {
+  settings.tick();
   scheduler.tick();
   view.draw();
   requestAnimationFrame(frame);

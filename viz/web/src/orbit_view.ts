@@ -3,7 +3,9 @@
 import * as THREE from "three";
 import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
 import { pinholeOfThreeCamera, poseOfThreeCamera, worldFromCamera } from "./convention";
+import type { PathView } from "./camera_path";
 import { CropBox } from "./crop_box";
+import { MeasureTool } from "./measure";
 import { Occlusion } from "./occlusion";
 import { Overlays } from "./overlays";
 import { PictureLayer } from "./picture_layer";
@@ -11,11 +13,10 @@ import { PointsLayer } from "./points_layer";
 import type { PosedCamera, Scene } from "./protocol";
 import type { View } from "./render_scheduler";
 import { RobotLayer } from "./robot_layer";
+import { ScanLayer } from "./scan_layer";
 import { surfacePoint } from "./surface_picker";
 
 const VERTICAL_FOV_DEGREES = 50;
-/** Larger windows are rendered at this width and upscaled. */
-const MAX_PICTURE_WIDTH_PX = 1280;
 /** The color --ground in app.css. */
 export const BACKGROUND: [number, number, number] = [0x0b / 255, 0x0e / 255, 0x13 / 255];
 
@@ -24,6 +25,7 @@ export class OrbitView {
   readonly picture = new PictureLayer(this.occlusion);
   readonly overlays = new Overlays(this.occlusion);
   readonly points = new PointsLayer(this.occlusion);
+  readonly scans = new ScanLayer(this.occlusion);
   readonly robot = new RobotLayer(this.occlusion, () => this.changed());
   private readonly camera = new THREE.PerspectiveCamera(VERTICAL_FOV_DEGREES, 1, 0.01, 200);
   /** The picture. It is drawn first; the other objects compare their depth with the picture's in their shaders. */
@@ -33,13 +35,16 @@ export class OrbitView {
   private readonly controls: OrbitControls;
   /** The part of the scene to draw. */
   readonly crop: CropBox;
+  readonly measure: MeasureTool;
+  /** Larger windows are rendered at this width and upscaled. */
+  maxPictureWidthPx = 1280;
   private followed: THREE.Vector3 | null = null;
   private followsRobot = false;
   private scene: Scene | null = null;
   private hasUserMoved = false;
   private isStale = true;
 
-  constructor(private readonly canvas: HTMLCanvasElement, onMove: () => void) {
+  constructor(private readonly canvas: HTMLCanvasElement, private readonly onMove: () => void) {
     this.renderer = new THREE.WebGLRenderer({ canvas, antialias: true });
     // Colors arrive as sRGB and are output unchanged.
     this.renderer.outputColorSpace = THREE.LinearSRGBColorSpace;
@@ -57,7 +62,8 @@ export class OrbitView {
       this.isStale = true;
       onMove();
     });
-    this.world.add(this.crop.root);
+    this.measure = new MeasureTool(this.camera, canvas, (x, y) => this.surfaceAt(x, y), () => this.changed());
+    this.world.add(this.crop.root, this.measure.root);
     this.controls.addEventListener("start", () => (this.hasUserMoved = true));
     this.renderer.autoClear = false;
     this.background.add(this.picture.mesh);
@@ -65,7 +71,7 @@ export class OrbitView {
     light.position.set(-0.4, 0.7, 1); // Over the viewer's left shoulder.
     this.camera.add(light);
     this.world.add(this.camera, new THREE.HemisphereLight(0xffffff, 0x5a6472, 1.7), this.overlays.root, this.robot.root);
-    this.world.add(this.points.root);
+    this.world.add(this.points.root, this.scans.root);
     canvas.addEventListener("dblclick", (event) => this.pivotAt(event.offsetX, event.offsetY));
     new ResizeObserver(() => {
       this.fit();
@@ -136,17 +142,45 @@ export class OrbitView {
     this.lookFrom(nearest.world_from_camera);
   }
 
-  /** Turns toward the surface at a pixel of the canvas, which becomes the center of the orbit. */
-  private pivotAt(x: number, y: number): void {
+  /** Shows a view of the camera path. */
+  showPathView(view: PathView): void {
+    this.camera.position.copy(view.position);
+    this.controls.target.copy(view.target);
+    this.fovDegrees = view.fovDegrees;
+    this.hasUserMoved = true;
+    this.controls.update();
+  }
+
+  /** The current view, for the camera path. */
+  pathView(): PathView {
+    return { position: this.camera.position, target: this.controls.target, fovDegrees: this.camera.fov };
+  }
+
+  /** Vertical field of view, degrees. */
+  set fovDegrees(degrees: number) {
+    if (degrees === this.camera.fov) return;
+    this.camera.fov = degrees;
+    this.camera.updateProjectionMatrix();
+    this.isStale = true;
+    this.onMove();
+  }
+
+  /** The point of the model's surface at a pixel of the canvas; null if there is none. */
+  private surfaceAt(x: number, y: number): THREE.Vector3 | null {
     const depth = this.picture.posedDepth;
-    if (!depth) return;
+    if (!depth) return null;
     const { clientWidth, clientHeight } = this.canvas;
     const raycaster = new THREE.Raycaster();
     raycaster.setFromCamera(
       new THREE.Vector2((2 * x) / clientWidth - 1, 1 - (2 * y) / clientHeight),
       this.camera,
     );
-    const point = surfacePoint(raycaster.ray, depth, this.camera.near, this.camera.far);
+    return surfacePoint(raycaster.ray, depth, this.camera.near, this.camera.far);
+  }
+
+  /** Turns toward the surface at a pixel of the canvas, which becomes the center of the orbit. */
+  private pivotAt(x: number, y: number): void {
+    const point = this.surfaceAt(x, y);
     if (!point) return;
     this.hasUserMoved = true;
     this.controls.target.copy(point);
@@ -175,7 +209,7 @@ export class OrbitView {
 
   /** The current view. */
   view(): View {
-    const scale = Math.min(1, MAX_PICTURE_WIDTH_PX / this.canvas.width);
+    const scale = Math.min(1, this.maxPictureWidthPx / this.canvas.width);
     const size_px: [number, number] = [
       Math.max(1, Math.round(this.canvas.width * scale)),
       Math.max(1, Math.round(this.canvas.height * scale)),
@@ -206,6 +240,7 @@ export class OrbitView {
     this.isStale = false;
     this.picture.setView(worldFromCamera(poseOfThreeCamera(this.camera)));
     this.crop.update();
+    this.measure.update();
     this.renderer.clear();
     this.renderer.render(this.background, this.camera);
     this.renderer.clearDepth();

@@ -3,9 +3,13 @@
 import * as THREE from "three";
 import { worldFromCamera } from "./convention";
 import { type Occlusion, ON_SURFACE } from "./occlusion";
-import type { PosedCamera, Scene } from "./protocol";
+import type { NumberedKeyframe, PosedCamera, Scene } from "./protocol";
 
-const KEYFRAME_COLOR = 0xe8edf3;
+/** Colors of the newest keyframe and of keyframes that are much older than AGE_SECS. */
+const NEW_COLOR = new THREE.Color(0x4cc2a6);
+const OLD_COLOR = new THREE.Color(0x9aa4b2);
+/** The color of a keyframe of this age is halfway between both. */
+const AGE_SECS = 10;
 const LIVE_COLOR = 0x4cc2a6;
 
 export class Overlays {
@@ -17,7 +21,8 @@ export class Overlays {
   private frustumDepth = 0.06;
 
   constructor(private readonly occlusion: Occlusion) {
-    this.keyframes = this.lines(KEYFRAME_COLOR, 0.35);
+    this.keyframes = this.lines(0xffffff, 0.45);
+    (this.keyframes.material as THREE.LineBasicMaterial).vertexColors = true;
     this.keyframes.visible = false; // Hundreds of them would hide the scene.
     this.root.add(this.ground, this.cameras, this.keyframes);
   }
@@ -50,8 +55,17 @@ export class Overlays {
     this.ground.add(grid, axesHelper);
   }
 
-  setKeyframes(keyframes: PosedCamera[]): void {
-    setLines(this.keyframes, keyframes.flatMap((keyframe) => frustum(keyframe, this.frustumDepth)));
+  /** Draws the frustums of keyframes, colored by age relative to the newest one. */
+  setKeyframes(keyframes: (PosedCamera | NumberedKeyframe)[]): void {
+    const frustums = keyframes.map((keyframe) => frustum(keyframe, this.frustumDepth));
+    setLines(this.keyframes, frustums.flat());
+    const secs = keyframes.map((keyframe) => ("stamp_nanos" in keyframe ? keyframe.stamp_nanos * 1e-9 : 0));
+    const newest = secs.reduce((max, value) => Math.max(max, value), -Infinity);
+    const colors = frustums.flatMap((points, ix) => {
+      const color = OLD_COLOR.clone().lerp(NEW_COLOR, 0.5 ** ((newest - secs[ix]!) / AGE_SECS));
+      return points.flatMap(() => color.toArray());
+    });
+    this.keyframes.geometry.setAttribute("color", new THREE.Float32BufferAttribute(colors, 3));
   }
 
   /** Sets whether the poses of the live cameras are current; if not, they are drawn faintly. */

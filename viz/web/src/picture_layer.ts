@@ -36,6 +36,7 @@ const FRAGMENT = /* glsl */ `
   uniform sampler2D colorMap;
   uniform sampler2D depthMap;
   uniform float emptyDepth;
+  uniform float opacity;
   uniform bool isMoved;
   uniform vec2 sizePx;
   uniform vec2 focalPx;
@@ -48,7 +49,7 @@ const FRAGMENT = /* glsl */ `
       if (!(depth > 0.0)) depth = emptyDepth;
       if (abs(pointInPicture.z - depth) > 0.08 * min(depth, pointInPicture.z)) discard;
     }
-    gl_FragColor = vec4(texture2D(colorMap, uv).rgb, 1.0);
+    gl_FragColor = vec4(texture2D(colorMap, uv).rgb, opacity);
   }`;
 
 export class PictureLayer {
@@ -71,7 +72,9 @@ export class PictureLayer {
         principalPx: { value: new THREE.Vector2() },
         emptyDepth: { value: 1 },
         isMoved: { value: false },
+        opacity: { value: 1 },
       },
+      transparent: true,
       side: THREE.DoubleSide,
     });
     this.mesh = new THREE.Mesh(gridGeometry(), material);
@@ -83,6 +86,11 @@ export class PictureLayer {
   set enabled(enabled: boolean) {
     this.isEnabled = enabled;
     this.mesh.visible = enabled && this.posedDepth !== null;
+  }
+
+  /** Opacity of the picture, 0 to 1. */
+  set opacity(opacity: number) {
+    this.mesh.material.uniforms.opacity!.value = opacity;
   }
 
   /** Sets the pose of the view, in fieldrig's convention. */

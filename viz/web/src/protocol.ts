@@ -14,7 +14,9 @@ export const CAPABILITIES = [
   "heartbeat",
   "robot",
   "keyframe_points",
-  "pause",
+  "range_scans",
+  "base_path",
+  "control",
 ] as const;
 export type Capability = (typeof CAPABILITIES)[number];
 
@@ -35,7 +37,7 @@ export interface Hello {
   capabilities?: string[];
   server: string;
   client: number;
-  /** Servers before the capability `pause` have none. */
+  /** Older servers have no roles. */
   role: Role | undefined;
   max_size_px: [number, number];
   default_stages: number[];
@@ -146,6 +148,12 @@ export interface Robot {
   joints: RobotJoint[];
 }
 
+/** Positions of a moving base so far. */
+export interface BasePath {
+  type: "base_path";
+  points_m: [number, number, number][];
+}
+
 /** Joint positions and base pose of the robot. */
 export interface RobotState {
   type: "robot_state";
@@ -249,11 +257,22 @@ export type TextMessage =
   | KeyframeChanges
   | Robot
   | RobotState
+  | BasePath
   | ErrorMessage
   | Heartbeat
   | Pong
   | Goodbye;
-export type BinaryHeader = PictureHeader | LiveImageHeader | KeyframePointsHeader;
+/** A scan of a range scanner, in world axes relative to the scanner. */
+export interface RangeScanHeader {
+  type: "range_scan";
+  scanner: string;
+  stamp_nanos: number;
+  origin_m: [number, number, number];
+  n_points: number;
+  meters_per_count: number;
+}
+
+export type BinaryHeader = PictureHeader | LiveImageHeader | KeyframePointsHeader | RangeScanHeader;
 
 export interface HelloMessage {
   type: "hello";
@@ -263,10 +282,15 @@ export interface HelloMessage {
 
 export interface SubscribeMessage {
   type: "subscribe";
-  topic: "status" | "keyframes" | "live_images" | "robot_state" | "keyframe_points";
+  topic: "status" | "keyframes" | "live_images" | "robot_state" | "keyframe_points" | "range_scans" | "base_path";
   rate_hz: number;
   camera?: string;
   size_px?: [number, number];
+}
+
+export interface ControlMessage {
+  type: "control";
+  action: "pause" | "resume" | "save";
 }
 
 export interface RenderMessage {
@@ -290,13 +314,7 @@ export interface PingMessage {
   t: number;
 }
 
-/** Pauses or continues training; only for operators. */
-export interface PauseMessage {
-  type: "pause";
-  is_paused: boolean;
-}
-
-export type ClientMessage = HelloMessage | RenderMessage | SubscribeMessage | PauseMessage | PingMessage;
+export type ClientMessage = HelloMessage | RenderMessage | SubscribeMessage | ControlMessage | PingMessage;
 
 /** Header and payload of a binary message: u32 little-endian header length, JSON header, payload. */
 export function unframe(message: ArrayBuffer): {

@@ -25,7 +25,8 @@ export class Readouts {
     );
     element("notes-card").hidden = status.notes.length === 0;
     element("notes").replaceChildren(...status.notes.map((note) => child("li", note)));
-    this.chart.set(model.psnr_history);
+    const others = [status, ...status.others].filter((other) => other.method !== model.method);
+    this.chart.set(model.psnr_history, others.map((other) => other.psnr_history));
   }
 }
 

@@ -39,6 +39,8 @@ export class RenderScheduler {
   private isWaiting = false;
   private isResting = false;
   private hasUpdate = false;
+  /** Whether every change of the model is requested as soon as the previous picture has arrived. */
+  isContinuous = false;
 
   constructor(
     private readonly connection: Connection,
@@ -100,7 +102,7 @@ export class RenderScheduler {
     } else if (!this.isResting && !this.isWaiting) {
       this.request([MOVING_SCALES[this.movingIx]!]);
     } else if (this.isResting && !this.isWaiting && this.hasUpdate) {
-      const pause = Math.max(REFRESH_MILLIS, this.lastMillis * (1 / REFRESH_SHARE - 1));
+      const pause = this.isContinuous ? 0 : Math.max(REFRESH_MILLIS, this.lastMillis * (1 / REFRESH_SHARE - 1));
       if (now - this.finishedAt > pause) this.request([1]);
     }
   }

@@ -1,6 +1,7 @@
 // Subscribes to the data that the page shows, at the rates and sizes at which it is shown.
 
 import type { Connection } from "./connection";
+import type { LiveImages } from "./live_images";
 import type { SubscribeMessage } from "./protocol";
 
 const STATUS_HZ = 2;
@@ -10,23 +11,34 @@ const IMAGES_HZ = 4;
 const ROBOT_HZ = 60;
 /** Keyframes whose points are sent per second, 22 kB each. */
 const POINTS_HZ = 20;
+/** Scans are sent this often, 36 kB each. */
+const SCANS_HZ = 2;
+const BASE_PATH_HZ = 1;
 /** Rate of the status, which the title bar needs, while the page is hidden. */
 const HIDDEN_STATUS_HZ = 0.5;
 /** Limits of the height of camera images, in CSS pixels: see `.live canvas` in app.css. */
 const IMAGE_HEIGHT = { min: 90, max: 190, ofWindow: 0.22 };
 const MAX_IMAGE_WIDTH_PX = 640;
+/** Maximum size of an enlarged image. */
+const ENLARGED_PX: [number, number] = [1280, 960];
 /** The server rounds image sizes down to multiples of this. */
 const IMAGE_STEP_PX = 16;
 /** While the window is being resized, image sizes are not sent. */
 const RESIZE_PAUSE_MILLIS = 200;
 
 export class Subscriptions {
-  /** The message sent last for each topic. A message that changes nothing would restart its topic. */
-  private readonly sent = new Map<SubscribeMessage["topic"], string>();
+  /** The message sent last for each topic and camera. A message that changes nothing would restart its topic. */
+  private readonly sent = new Map<string, string>();
   private resizeTimer = 0;
   private showsPoints = false;
+  private showsScans = true;
 
-  constructor(private readonly connection: Connection) {
+  private showsImages = true;
+
+  constructor(
+    private readonly connection: Connection,
+    private readonly liveImages: LiveImages,
+  ) {
     document.addEventListener("visibilitychange", () => this.update());
     window.addEventListener("resize", () => {
       window.clearTimeout(this.resizeTimer);
@@ -46,36 +58,59 @@ export class Subscriptions {
     this.update();
   }
 
-  private update(): void {
+  /** Whether range scans are shown. */
+  set scans(shown: boolean) {
+    this.showsScans = shown;
+    this.update();
+  }
+
+  /** Whether camera images are shown. Otherwise, they are small: their poses are still needed. */
+  set images(shown: boolean) {
+    this.showsImages = shown;
+    this.update();
+  }
+
+  /** Sends the subscriptions that have changed. */
+  update(): void {
     if (!this.connection.isOpen || !this.connection.supports("subscribe")) return;
     for (const message of document.hidden ? this.whileHidden() : this.whileVisible()) {
       const json = JSON.stringify(message);
-      if (this.sent.get(message.topic) === json) continue;
-      this.sent.set(message.topic, json);
+      const key = `${message.topic} ${message.camera ?? ""}`;
+      if (this.sent.get(key) === json) continue;
+      this.sent.set(key, json);
       this.connection.send(message);
     }
   }
 
   private whileVisible(): SubscribeMessage[] {
-    const { min, max, ofWindow } = IMAGE_HEIGHT;
-    const height = Math.min(max, Math.max(min, ofWindow * window.innerHeight)) * Math.min(devicePixelRatio, 2);
+    const images = { type: "subscribe", topic: "live_images", rate_hz: IMAGES_HZ } as const;
     const messages: SubscribeMessage[] = [
       { type: "subscribe", topic: "status", rate_hz: STATUS_HZ },
       { type: "subscribe", topic: "keyframes", rate_hz: KEYFRAMES_HZ },
-      {
-        type: "subscribe",
-        topic: "live_images",
-        rate_hz: IMAGES_HZ,
-        size_px: [MAX_IMAGE_WIDTH_PX, IMAGE_STEP_PX * Math.ceil(height / IMAGE_STEP_PX)],
-      },
+      { ...images, size_px: this.thumbnailPx() },
     ];
+    for (const [camera, isEnlarged] of this.liveImages.resized) {
+      messages.push({ ...images, camera, size_px: isEnlarged && this.showsImages ? ENLARGED_PX : this.thumbnailPx() });
+    }
     if (this.connection.supports("robot")) {
       messages.push({ type: "subscribe", topic: "robot_state", rate_hz: ROBOT_HZ });
     }
-    if (this.connection.supports("keyframe_points")) {
-      messages.push({ type: "subscribe", topic: "keyframe_points", rate_hz: this.showsPoints ? POINTS_HZ : 0 });
+    const layers = [
+      ["keyframe_points", this.showsPoints ? POINTS_HZ : 0],
+      ["range_scans", this.showsScans ? SCANS_HZ : 0],
+      ["base_path", BASE_PATH_HZ],
+    ] as const;
+    for (const [topic, rate_hz] of layers) {
+      if (this.connection.supports(topic)) messages.push({ type: "subscribe", topic, rate_hz });
     }
     return messages;
+  }
+
+  private thumbnailPx(): [number, number] {
+    if (!this.showsImages) return [IMAGE_STEP_PX, IMAGE_STEP_PX];
+    const { min, max, ofWindow } = IMAGE_HEIGHT;
+    const height = Math.min(max, Math.max(min, ofWindow * window.innerHeight)) * Math.min(devicePixelRatio, 2);
+    return [MAX_IMAGE_WIDTH_PX, IMAGE_STEP_PX * Math.ceil(height / IMAGE_STEP_PX)];
   }
 
   private whileHidden(): SubscribeMessage[] {
@@ -84,8 +119,12 @@ export class Subscriptions {
       { type: "subscribe", topic: "keyframes", rate_hz: 0 },
       { type: "subscribe", topic: "live_images", rate_hz: 0 },
     ];
-    for (const [capability, topic] of [["robot", "robot_state"], ["keyframe_points", "keyframe_points"]] as const) {
-      if (this.connection.supports(capability)) messages.push({ type: "subscribe", topic, rate_hz: 0 });
+    for (const camera of this.liveImages.resized.keys()) {
+      messages.push({ type: "subscribe", topic: "live_images", camera, rate_hz: 0 });
+    }
+    if (this.connection.supports("robot")) messages.push({ type: "subscribe", topic: "robot_state", rate_hz: 0 });
+    for (const topic of ["keyframe_points", "range_scans", "base_path"] as const) {
+      if (this.connection.supports(topic)) messages.push({ type: "subscribe", topic, rate_hz: 0 });
     }
     return messages;
   }

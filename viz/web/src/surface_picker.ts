@@ -13,21 +13,30 @@ export interface PosedDepth {
 }
 
 const N_STEPS = 400;
+/** Halvings of the step that contains the surface. A step is about 2 % of the distance. */
+const N_HALVINGS = 12;
 
 /** The first point on the ray that lies behind the surface in the picture's depth map; null if there is none. */
 export function surfacePoint(ray: Ray, posed: PosedDepth, nearM: number, farM: number): Vector3 | null {
   const pictureFromWorld = posed.worldFromPicture.clone().invert();
-  const point = new Vector3();
   const inPicture = new Vector3();
+  const isBehindSurface = (distance: number): boolean => {
+    ray.at(distance, inPicture).applyMatrix4(pictureFromWorld);
+    const surface = depthAt(posed, inPicture);
+    return surface > 0 && inPicture.z >= surface;
+  };
   let before = nearM;
   for (let step = 1; step <= N_STEPS; step++) {
     // Steps grow with the distance.
     const distance = nearM * (farM / nearM) ** (step / N_STEPS);
-    ray.at(distance, point);
-    inPicture.copy(point).applyMatrix4(pictureFromWorld);
-    const surface = depthAt(posed, inPicture);
-    if (surface > 0 && inPicture.z >= surface) {
-      return ray.at(0.5 * (before + distance), point);
+    if (isBehindSurface(distance)) {
+      let behind = distance;
+      for (let halving = 0; halving < N_HALVINGS; halving++) {
+        const middle = 0.5 * (before + behind);
+        if (isBehindSurface(middle)) behind = middle;
+        else before = middle;
+      }
+      return ray.at(behind, new Vector3());
     }
     before = distance;
   }

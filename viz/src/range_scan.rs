@@ -1,0 +1,98 @@
+//! Scans of range scanners, for viewers.
+
+use crate::server_message::{BinaryHeader, RangeScanHeader, frame};
+use keyframe::RangePoints;
+use kinematics::Transform;
+use nalgebra::{Point3, Vector3};
+use std::sync::Arc;
+
+/// Maximum number of points that are sent per scan.
+const MAX_POINTS: usize = 6000;
+
+/// A scan and the correction of its base pose.
+#[derive(Clone, Debug, PartialEq)]
+pub struct RangeScan {
+    /// The points, before the correction.
+    pub scan: Arc<RangePoints>,
+    /// Corrects the world coordinates of the points.
+    pub map_from_odom: Transform,
+}
+
+/// The binary message with a scan; `None` without points.
+pub(crate) fn pack_range_scan(range_scan: &RangeScan) -> Option<Vec<u8>> {
+    let RangeScan { scan, map_from_odom } = range_scan;
+    let origin = map_from_odom * Point3::from(scan.world_from_scanner.translation.vector);
+    let stride = scan.points_in_world_m.len().div_ceil(MAX_POINTS).max(1);
+    let from_origin = |point: &[f32; 3]| map_from_odom * Point3::from(*point).cast::<f64>() - origin;
+    let points: Vec<Vector3<f64>> = scan.points_in_world_m.iter().step_by(stride).map(from_origin).collect();
+    let extent_m = points.iter().flat_map(|point| point.iter()).fold(0.0_f64, |max, value| max.max(value.abs()));
+    if extent_m <= 0.0 || !extent_m.is_finite() {
+        return None;
+    }
+    let meters_per_count = extent_m / f64::from(i16::MAX);
+    #[expect(clippy::cast_possible_truncation, reason = "the largest coordinate is i16::MAX counts")]
+    let count = |value: &f64| ((value / meters_per_count).round() as i16).to_le_bytes();
+    let positions: Vec<u8> = points.iter().flat_map(|point| point.iter().flat_map(count)).collect();
+    let header = RangeScanHeader {
+        scanner: &scan.scanner,
+        stamp_nanos: scan.stamp.0,
+        origin_m: origin.into(),
+        n_points: points.len(),
+        meters_per_count,
+    };
+    Some(frame(&BinaryHeader::RangeScan(header), &[&positions]))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{MAX_POINTS, RangeScan, pack_range_scan};
+    use keyframe::RangePoints;
+    use kinematics::{Stamp, Transform};
+    use nalgebra::Vector3;
+
+    fn scan(n: usize) -> RangeScan {
+        let point = |ix: usize| {
+            #[expect(clippy::cast_precision_loss, reason = "a small number")]
+            let angle = ix as f32;
+            [2.0 + angle.cos(), 3.0 * angle.sin(), 0.5]
+        };
+        RangeScan {
+            scan: RangePoints {
+                scanner: "lidar".into(),
+                stamp: Stamp(5),
+                world_from_scanner: Transform::translation(2.0, 0.0, 0.4),
+                points_in_world_m: (0..n).map(point).collect(),
+            }
+            .into(),
+            map_from_odom: Transform::rotation(Vector3::new(0.0, 0.0, 0.3)),
+        }
+    }
+
+    #[test]
+    fn points_are_corrected_and_relative_to_the_scanner() {
+        let range_scan = scan(20_000);
+        let message = pack_range_scan(&range_scan).expect("points");
+        let n_header = u32::from_le_bytes(message[..4].try_into().expect("4 bytes")) as usize;
+        let header: serde_json::Value = serde_json::from_slice(&message[4..4 + n_header]).expect("JSON");
+        let n = usize::try_from(header["n_points"].as_u64().expect("a number")).expect("small");
+        assert!(n <= MAX_POINTS && n > MAX_POINTS / 2, "{header}");
+        let numbers = |name: &str| header[name].as_f64().expect("a number");
+        let origin = [0, 1, 2].map(|axis| header["origin_m"][axis].as_f64().expect("a number"));
+        let payload = &message[4 + n_header..];
+        assert_eq!(payload.len(), 6 * n);
+        let stride = range_scan.scan.points_in_world_m.len().div_ceil(n);
+        for (ix, bytes) in payload.chunks_exact(6).enumerate() {
+            let count = |axis: usize| i16::from_le_bytes([bytes[2 * axis], bytes[2 * axis + 1]]);
+            let got = Vector3::from(
+                [0, 1, 2].map(|axis| origin[axis] + f64::from(count(axis)) * numbers("meters_per_count")),
+            );
+            let point = nalgebra::Point3::from(range_scan.scan.points_in_world_m[ix * stride]).cast::<f64>();
+            assert!((got - (range_scan.map_from_odom * point).coords).norm() < 2e-4, "{ix}: {got}");
+        }
+    }
+
+    #[test]
+    fn empty_scans_are_not_sent() {
+        assert_eq!(pack_range_scan(&scan(0)), None);
+    }
+}

@@ -1,0 +1,17 @@
+// Panels below the toolbar; at most one is open.
+
+import { element } from "./element";
+
+/** Opens and closes panels with their buttons: ids of the buttons, and of the panels. Returns the function for a press of a button. */
+export function panels(ids: Record<string, string>): (button: string) => void {
+  const toolbar = element("toolbar");
+  return (pressed) => {
+    for (const [button, id] of Object.entries(ids)) {
+      const panel = element(id);
+      const isOpen = button === pressed && panel.hidden;
+      panel.hidden = !isOpen;
+      panel.style.top = `${toolbar.offsetTop + toolbar.offsetHeight + 6}px`; // The toolbar may have several rows.
+      element(button).setAttribute("aria-expanded", String(isOpen));
+    }
+  };
+}
