@@ -285,6 +285,35 @@ fn interrupted(folder: &Path, args: &[&str], meanwhile: impl FnOnce(&Value)) -> 
     printed
 }
 
+/// Pauses training and continues it. Meanwhile, no model takes a step.
+fn pause_and_continue(url: &str) {
+    use std::time::{Duration, Instant};
+    let address = url.trim_start_matches("http://").trim_end_matches('/');
+    let stream = std::net::TcpStream::connect(address).expect("the server listens");
+    stream.set_read_timeout(Some(Duration::from_secs(60))).expect("a timeout");
+    let (mut socket, _) = tungstenite::client(format!("ws://{address}/ws"), stream).expect("a WebSocket");
+    let pause = |socket: &mut tungstenite::WebSocket<std::net::TcpStream>, is_paused: bool| {
+        let message = serde_json::json!({"type": "control", "action": if is_paused { "pause" } else { "resume" }});
+        socket.send(tungstenite::Message::text(message.to_string())).expect("sent");
+    };
+    let steps_in = |socket: &mut tungstenite::WebSocket<std::net::TcpStream>, state: &str| loop {
+        let tungstenite::Message::Text(text) = socket.read().expect("a status") else { continue };
+        let status: Value = serde_json::from_str(&text).expect("JSON");
+        if status["type"] == "status" && status["state"] == state {
+            return [&status, &status["others"][0]].map(|model| model["step"].as_u64().expect("a number"));
+        }
+    };
+    pause(&mut socket, true);
+    steps_in(&mut socket, "paused"); // Queued steps may still be counted.
+    let paused_at = steps_in(&mut socket, "paused");
+    let started = Instant::now();
+    while started.elapsed() < Duration::from_secs(1) {
+        assert_eq!(steps_in(&mut socket, "paused"), paused_at);
+    }
+    pause(&mut socket, false);
+    while steps_in(&mut socket, "training")[1] == paused_at[1] {}
+}
+
 /// Requests a picture of each model, and of a model that does not exist.
 fn request_picture_of_each_method(url: &str) {
     let address = url.trim_start_matches("http://").trim_end_matches('/');

@@ -115,6 +115,8 @@ pub enum Decision {
     Align(True),
     /// A search for the model size was ended, because too little training time was left.
     EndSizeSearch(True),
+    /// Growth of the model was paused, because its steps took too long, or continued.
+    PauseGrowth(bool),
     /// A checkpoint was taken at this step.
     Checkpoint(True),
     /// Training ended.
@@ -283,6 +285,12 @@ impl DecisionLog {
     pub fn size_search_ended(&mut self, step: u64) {
         self.log_activity(step);
         self.write(Line::Entry(Entry { step, decision: Decision::EndSizeSearch(True) }));
+    }
+
+    /// Logs that growth was paused or continued after this many steps.
+    pub fn growth_paused(&mut self, step: u64, is_paused: bool) {
+        self.log_activity(step);
+        self.write(Line::Entry(Entry { step, decision: Decision::PauseGrowth(is_paused) }));
     }
 
     /// Records that a picture was drawn.

@@ -260,6 +260,10 @@ impl Live {
         if self.is_scoring() {
             return Ok(());
         }
+        if self.is_paused && self.pace != Pace::RealTime {
+            self.hub.wait_for_request(IDLE); // The next keyframe is due at a later step.
+            return Ok(());
+        }
         self.apply_alignments()?;
         if let Some(first_image) = self.feed.first_image() {
             self.sessions.iter_mut().for_each(|session| session.start_clock(first_image));
@@ -348,6 +352,9 @@ impl Live {
             true => due[ix].saturating_sub(session.progress().step),
             false => u64::MAX,
         };
+        if self.pace == Pace::RealTime {
+            self.sessions.iter_mut().try_for_each(Session::pause_growth_when_slow)?;
+        }
         let before = Instant::now();
         let step_before = self.sessions[0].progress().step;
         let (hub, budget) = (&self.hub, self.budget);

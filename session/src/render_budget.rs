@@ -1,6 +1,6 @@
 //! Limits the share of time that is spent on drawing pictures during training.
 //!
-//! Each second of training adds credit for pictures: a second on a software adapter, 0.6 seconds on a GPU. Pictures
+//! Each second of training adds credit for pictures: a second on a software adapter, 0.66 seconds on a GPU. Pictures
 //! are drawn immediately while credit is left. Training therefore keeps at least 1/2 or 5/8 of the time, unless a single
 //! picture takes longer than the maximum debt.
 
@@ -14,7 +14,7 @@ const MAX_DEBT_SECS: f64 = 1.0;
 
 /// Credit per second of training.
 const CREDIT_ON_SOFTWARE: f64 = 1.0;
-const CREDIT_ON_GPU: f64 = 0.6;
+const CREDIT_ON_GPU: f64 = 0.66;
 
 /// The time available for pictures.
 #[derive(Clone, Copy, Debug, PartialEq)]

@@ -148,6 +148,7 @@ impl Replay {
                 Decision::Seed(_) => session.seed()?,
                 Decision::Align(_) => drop(session.poll_alignment(true)?),
                 Decision::EndSizeSearch(_) => session.end_size_search()?,
+                Decision::PauseGrowth(is_paused) => session.pause_growth(*is_paused)?,
                 Decision::Begin(_) => drop(session.step(0)?),
                 Decision::Restored(_) | Decision::Checkpoint(_) | Decision::End(_) => {}
             }

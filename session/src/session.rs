@@ -37,6 +37,8 @@ use training_time::TrainingTime;
 
 /// Approximate duration of a slice. The device is idle for a moment at the end of each slice.
 const TIME_SLICE: Duration = Duration::from_millis(40);
+/// Step time at which a live run pauses the growth of its model. Pictures take about as long as steps.
+const MAX_LIVE_STEP_MILLIS: f64 = 300.0;
 
 /// A model in training.
 pub struct Session {
@@ -274,6 +276,27 @@ impl Session {
     pub(crate) fn end_size_search(&mut self) -> crate::Result<()> {
         if self.method.end_size_search()? {
             self.persistence.log_size_search_end(self.method.as_mut())?;
+        }
+        Ok(())
+    }
+
+    /// Pauses the growth of the model while its steps take too long for a live run. A larger model would be trained and
+    /// drawn even more slowly, so that an operator would see less.
+    pub(crate) fn pause_growth_when_slow(&mut self) -> crate::Result<()> {
+        match self.progress().step_millis {
+            millis if millis > MAX_LIVE_STEP_MILLIS => self.pause_growth(true),
+            millis if millis < 0.5 * MAX_LIVE_STEP_MILLIS => self.pause_growth(false),
+            _ => Ok(()),
+        }
+    }
+
+    /// Pauses or continues the growth of the model.
+    pub(crate) fn pause_growth(&mut self, is_paused: bool) -> crate::Result<()> {
+        if self.method.pause_growth(is_paused)? {
+            let Progress { primitives, step_millis, .. } = self.progress();
+            let verb = if is_paused { "stops" } else { "continues" };
+            log::info!("the model {verb} growing at {primitives} splats, because a step takes {step_millis:.0} ms");
+            self.persistence.log_growth_pause(self.method.as_mut(), is_paused)?;
         }
         Ok(())
     }

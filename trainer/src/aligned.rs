@@ -492,6 +492,10 @@ impl<M: Recalibrate + 'static> Method for Aligned<M> {
         self.model.end_size_search()
     }
 
+    fn pause_growth(&mut self, is_paused: bool) -> Result<bool, Error> {
+        self.model.pause_growth(is_paused)
+    }
+
     fn progress(&self) -> Progress {
         self.model.progress()
     }

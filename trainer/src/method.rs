@@ -117,6 +117,10 @@ pub trait Method {
     fn end_size_search(&mut self) -> Result<bool, Error> {
         Ok(false)
     }
+    /// Pauses or continues the growth of the model. Returns false if this changes nothing, or is not possible now.
+    fn pause_growth(&mut self, _is_paused: bool) -> Result<bool, Error> {
+        Ok(false)
+    }
     /// Progress of training.
     fn progress(&self) -> Progress;
     /// Reports of the trials, in the order in which they ran.

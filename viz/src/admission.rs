@@ -82,6 +82,8 @@ struct Registry {
 #[derive(Debug)]
 pub(crate) struct Connection {
     number: u64,
+    /// Whether the peer has a loopback address. It may still be the end of a tunnel.
+    is_loopback: bool,
     /// Size that the kernel's send buffer should have, bytes; 0 if it should not change.
     send_buffer_bytes: AtomicUsize,
     state: Mutex<ConnectionState>,
@@ -133,10 +135,11 @@ impl Admission {
 
     /// Adds an accepted connection. Returns whether another one was closed to make room.
     pub(crate) fn admit(self: &Arc<Self>, stream: TcpStream) -> (GuardedStream, bool) {
+        let is_loopback = stream.peer_addr().is_ok_and(|peer| peer.ip().to_canonical().is_loopback());
         let has_evicted = self.registry().connections.len() >= self.limits.connections && self.evict();
         let mut registry = self.registry();
         registry.n_opened += 1;
-        let connection = Arc::new(Connection::new(registry.n_opened));
+        let connection = Arc::new(Connection::new(registry.n_opened, is_loopback));
         registry.connections.insert(connection.number, Arc::clone(&connection));
         drop(registry);
         (GuardedStream { stream, connection, admission: Arc::clone(self) }, has_evicted)
@@ -202,7 +205,7 @@ impl Admission {
 }
 
 impl Connection {
-    fn new(number: u64) -> Self {
+    fn new(number: u64, is_loopback: bool) -> Self {
         let state = ConnectionState {
             is_closed: false,
             reader: None,
@@ -213,7 +216,12 @@ impl Connection {
             opened: Instant::now(),
             client: None,
         };
-        Self { number, send_buffer_bytes: AtomicUsize::new(0), state: Mutex::new(state) }
+        Self { number, is_loopback, send_buffer_bytes: AtomicUsize::new(0), state: Mutex::new(state) }
+    }
+
+    /// Whether the peer has a loopback address.
+    pub(crate) fn is_loopback(&self) -> bool {
+        self.is_loopback
     }
 
     /// Records that a complete request has arrived.

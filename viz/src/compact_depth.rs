@@ -23,7 +23,7 @@ const LEVEL: u32 = 3;
 /// How much time is spent on compression.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Effort {
-    /// About 1 ms per megapixel of the picture, for connections on which 20 % more bytes take less time than that.
+    /// About 1 ms per megapixel of the picture, for connections on which more bytes take less time than that.
     Fast,
     /// About 5 ms per megapixel.
     Small,
@@ -51,17 +51,23 @@ pub(crate) fn compress(depth: &PackedDepth, effort: Effort) -> std::io::Result<C
     let nearest = counts.clone().filter(|count| *count > 0).min().unwrap_or(1);
     let min_m = f64::from(nearest) * depth.meters_per_count;
     let log_step = LOG_STEP.ln_1p();
-    let codes: Vec<u16> = counts.map(|count| log_count(count, nearest, log_step)).collect();
-    let width = (depth.size_px[0] as usize).max(1);
-    let (mut symbols, mut escaped) = (Vec::with_capacity(codes.len()), Vec::new());
-    for (ix, &code) in codes.iter().enumerate() {
-        let predicted = prediction(&codes, width, ix);
-        match symbol(code, predicted) {
-            Some(symbol) => symbols.push(symbol),
-            None => {
-                symbols.push(ESCAPE);
-                escaped.extend(code.to_le_bytes());
+    let counts: Vec<u16> = counts.collect();
+    let (mut symbols, mut escaped) = (Vec::with_capacity(counts.len()), Vec::new());
+    // The count to the left predicts a count; in the first column, the count above.
+    let mut above = 0;
+    for row in counts.chunks((depth.size_px[0] as usize).max(1)) {
+        let mut predicted = above;
+        above = log_count(row[0], nearest, log_step);
+        for &count in row {
+            let code = log_count(count, nearest, log_step);
+            match symbol(code, predicted) {
+                Some(symbol) => symbols.push(symbol),
+                None => {
+                    symbols.push(ESCAPE);
+                    escaped.extend(code.to_le_bytes());
+                }
             }
+            predicted = code;
         }
     }
     symbols.append(&mut escaped);
@@ -86,12 +92,6 @@ fn log_count(count: u16, nearest: u16, log_step: f64) -> u16 {
     (above / log_step as f32 + 1.5) as u16
 }
 
-/// The count to the left predicts a count; in the first column, the count above.
-fn prediction(codes: &[u16], width: usize, ix: usize) -> u16 {
-    let before = if ix.is_multiple_of(width) { ix.checked_sub(width) } else { ix.checked_sub(1) };
-    before.map_or(0, |before| codes[before])
-}
-
 /// The difference to the prediction: 0, -1, 1, -2, 2, ...; `None` if it is too large, or the pixel or its prediction
 /// has no surface but not both.
 fn symbol(code: u16, predicted: u16) -> Option<u8> {
@@ -104,7 +104,7 @@ fn symbol(code: u16, predicted: u16) -> Option<u8> {
 
 #[cfg(test)]
 pub(crate) mod tests {
-    use super::{CompactDepth, ESCAPE, Effort, compress, prediction};
+    use super::{CompactDepth, ESCAPE, Effort, compress};
     use flate2::read::ZlibDecoder;
     use kinematics::random::Random;
     use std::io::Read;
@@ -116,17 +116,18 @@ pub(crate) mod tests {
         let mut bytes = Vec::new();
         ZlibDecoder::new(&*compact.bytes).read_to_end(&mut bytes).expect("a zlib stream");
         let mut escaped = bytes[n..].chunks_exact(2).map(|count| u16::from_le_bytes([count[0], count[1]]));
+        let width = compact.size_px[0] as usize;
         let mut codes: Vec<u16> = Vec::new();
         for (ix, &symbol) in bytes[..n].iter().enumerate() {
-            codes.push(0);
-            let predicted = i32::from(prediction(&codes, compact.size_px[0] as usize, ix));
-            codes[ix] = match symbol {
+            let before = if ix.is_multiple_of(width) { ix.checked_sub(width) } else { ix.checked_sub(1) };
+            let predicted = before.map_or(0, |before| i32::from(codes[before]));
+            codes.push(match symbol {
                 ESCAPE => escaped.next().expect("a count"),
                 symbol => {
                     let half = i32::from(symbol.div_ceil(2));
                     u16::try_from(predicted + if symbol % 2 == 0 { half } else { -half }).expect("a count")
                 }
-            };
+            });
         }
         assert_eq!(escaped.next(), None, "all counts are used");
         let meters = |code: u16| compact.min_m * (compact.log_step * (f64::from(code) - 1.0)).exp();

@@ -85,10 +85,10 @@ struct Shared {
     demands: Mutex<BTreeMap<u64, Demand>>,
     /// For each camera: transform `reported_from_corrected`.
     camera_corrections: Mutex<BTreeMap<Arc<str>, Transform>>,
-    /// Whether somebody besides the clients needs images and robot states.
-    is_observed: AtomicBool,
     /// Actions that the run has not taken yet, without repetitions.
     controls: Mutex<Vec<Control>>,
+    /// Whether somebody besides the clients needs images and robot states.
+    is_observed: AtomicBool,
     queue: Mutex<Queue>,
     work_arrived: Condvar,
 }
@@ -183,8 +183,8 @@ impl Hub {
     /// Whether a client draws the robot, or the path of its base is due.
     pub fn needs_robot_state(&self) -> bool {
         let is_path_due = self.shared.path_extended.lock().is_none_or(|at| at.elapsed() >= PATH_PERIOD);
-        is_path_due
-            || self.is_observed()
+        self.is_observed()
+            || is_path_due
             || self.shared.demands.lock().values().any(|demand| demand.subscriptions.robot_state.is_some())
     }
 

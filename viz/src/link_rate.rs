@@ -14,6 +14,8 @@ const BUFFER_BYTES: std::ops::RangeInclusive<f64> = 8192.0..=65_536.0;
 const INITIAL_BYTES_PER_SEC: f64 = 1.25e6;
 /// Above this rate, fast compression saves more time than its additional bytes take.
 const FAST_BYTES_PER_SEC: f64 = 6e6;
+/// Slower loopback connections are probably tunnels to another computer.
+const LOCAL_BYTES_PER_SEC: f64 = 3e7;
 /// Shorter sends do not measure the link, but the memory of this computer.
 const MIN_SEND_SECS: f64 = 2e-4;
 /// Parts of less than half the usual size measure the link only if they take at least this long. Otherwise, the time
@@ -63,9 +65,13 @@ impl LinkRate {
         }
     }
 
-    /// How to compress data for this connection.
-    pub(crate) fn effort(self) -> Effort {
-        if self.bytes_per_sec > FAST_BYTES_PER_SEC { Effort::Fast } else { Effort::Small }
+    /// How to compress data for this connection. `None` within a computer, where compression takes longer than it saves.
+    pub(crate) fn effort(self, is_loopback: bool) -> Option<Effort> {
+        match self.bytes_per_sec {
+            rate if is_loopback && rate > LOCAL_BYTES_PER_SEC => None,
+            rate if rate > FAST_BYTES_PER_SEC => Some(Effort::Fast),
+            _ => Some(Effort::Small),
+        }
     }
 
     /// Size of the parts of long messages.
@@ -125,7 +131,8 @@ mod tests {
             rate.observe(rate.part_bytes(), Duration::from_micros(20), Duration::ZERO);
         }
         assert_eq!((rate.part_bytes(), rate.buffer_bytes()), (65_536, 65_536));
-        assert_eq!((rate.effort(), LinkRate::default().effort()), (Effort::Fast, Effort::Small));
+        assert_eq!([true, false].map(|is_loopback| rate.effort(is_loopback)), [None, Some(Effort::Fast)]);
+        assert_eq!(LinkRate::default().effort(true), Some(Effort::Small));
         // The short ends of messages do not look like a slow link.
         for _ in 0..40 {
             rate.observe(300, Duration::from_micros(250), Duration::ZERO);

@@ -47,7 +47,7 @@ pub(crate) fn pack_picture(
     view_request: &ViewRequest,
     mut header: PictureHeader,
     rendered: &Rendered,
-    effort: Effort,
+    effort: Option<Effort>,
 ) -> Result<Vec<u8>, PackError> {
     let began = Instant::now();
     let encoded;
@@ -61,10 +61,14 @@ pub(crate) fn pack_picture(
     let offset = color.map_or(0, <[u8]>::len);
     header.color = color.map(|color| ColorPart { format: "jpeg", offset: 0, bytes: color.len() });
     let compact;
-    let depth_bytes = match depth.zip(view_request.depth) {
+    let format = match (view_request.depth, effort) {
+        (Some(DepthFormat::CompactHalf), None) => Some(DepthFormat::U16Half),
+        (requested, _) => requested,
+    };
+    let depth_bytes = match depth.zip(format) {
         None => &[][..],
         Some((packed, format @ DepthFormat::CompactHalf)) => {
-            compact = compress(packed, effort)?;
+            compact = compress(packed, effort.unwrap_or(Effort::Fast))?;
             header.depth = Some(DepthPart {
                 format,
                 size_px: compact.size_px,

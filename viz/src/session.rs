@@ -143,7 +143,7 @@ impl Reader<'_> {
                 None
             }
             ClientMessage::Control(ControlMessage { action }) => {
-                log::info!("client {} requested {action:?}", self.client);
+                log::info!("client {}: {action:?}", self.client);
                 self.hub.control(action);
                 None
             }

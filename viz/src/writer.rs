@@ -119,7 +119,9 @@ impl Writer<'_> {
                 && let Some(outgoing) = self.server_context.hub.collect(self.client)
             {
                 match outgoing {
-                    Outgoing::Picture(rendered) => encoding = Some(encode(rendered, self.link.effort())),
+                    Outgoing::Picture(rendered) => {
+                        encoding = Some(encode(rendered, self.link.effort(self.connection.is_loopback())))
+                    }
                     Outgoing::Failed { id, view, reason } => {
                         let sent = self.send_error(Some(id), &view, &reason).await;
                         self.server_context.hub.release(self.client);
@@ -305,7 +307,7 @@ impl Writer<'_> {
     }
 }
 
-fn encode(rendered: Box<(RenderJob, PictureHeader, Rendered)>, effort: Effort) -> EncodingTask {
+fn encode(rendered: Box<(RenderJob, PictureHeader, Rendered)>, effort: Option<Effort>) -> EncodingTask {
     let view_request = &rendered.0.view_request;
     let (id, view) = (view_request.id, Arc::clone(&view_request.view));
     let task = tokio::task::spawn_blocking(move || {

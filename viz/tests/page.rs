@@ -464,7 +464,7 @@ fn page_shows_connection_loss_and_run_result() {
     let mut browser = Browser::open(&program, &profile, &format!("http://{}/", proxy.address()), DESKTOP_PX);
     wait_for(&mut browser, "a picture", |browser| browser.text("picture-text").contains(" ms"));
     let first_millis = browser.evaluate("performance.now()").as_f64().expect("a time");
-    println!("first picture after {first_millis:.0} ms");
+    eprintln!("first picture after {first_millis:.0} ms");
     assert!(first_millis < MAX_FIRST_PICTURE_MILLIS, "the first picture was shown after {first_millis} ms");
     let camera = Camera::start(hub.clone());
     wait_for(&mut browser, "a full picture", |browser| browser.text("picture-text").contains("100 %"));

@@ -144,7 +144,7 @@ fn tasks_of_the_main_thread_are_short() {
     std::fs::remove_dir_all(&profile).expect("the browser has left its profile");
     tasks.sort_by(f64::total_cmp);
     let percentile = |share: usize| tasks[(tasks.len() - 1) * share / 1000];
-    println!(
+    eprintln!(
         "{} tasks: median {:.2} ms, 99 % {:.2} ms, 99.9 % {:.2} ms, longest {:.2} ms",
         tasks.len(),
         percentile(500),

@@ -175,11 +175,9 @@ fn only_operators_change_the_run() {
 
     let mut operator = shared.client(&shared.operator);
     assert_eq!(operator.text_of("hello")["role"], json!("operator"));
-    for (name, action) in [("pause", Control::Pause), ("resume", Control::Resume), ("save", Control::Save)] {
-        operator.send(&json!({"type": "control", "action": name}));
-        assert!(operator.is_answered(), "the message before was read");
-        assert_eq!(shared.hub.take_controls(), [action]);
-    }
+    operator.send(&json!({"type": "control", "action": "pause"}));
+    assert!(operator.is_answered(), "the message before was read");
+    assert_eq!(shared.hub.take_controls(), [Control::Pause]);
     assert!(viewer.is_answered(), "a refused message does not end the connection");
 }
 

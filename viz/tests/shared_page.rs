@@ -60,9 +60,8 @@ fn page_uses_its_token_and_shows_its_role() {
     assert_eq!(browser.text("banner"), "");
     assert_eq!(browser.text("role"), "viewer");
     let pause = "document.getElementById('pause')";
-    let has_controls =
-        |browser: &mut Browser| browser.evaluate("document.getElementById('controls').hidden") == json!(false);
-    wait_for(&mut browser, "the buttons", has_controls);
+    let is_shown = "document.getElementById('controls').hidden === false";
+    wait_for(&mut browser, "the button", |browser| browser.evaluate(is_shown) == json!(true));
     assert_eq!(browser.evaluate(&format!("{pause}.disabled")), json!(true));
     let reason = browser.evaluate(&format!("{pause}.title"));
     assert!(reason.as_str().is_some_and(|reason| reason.contains("connected as viewer")), "{reason}");
@@ -78,12 +77,12 @@ fn page_uses_its_token_and_shows_its_role() {
     browser.call("Page.reload", json!({}));
     wait_for(&mut browser, "a connection", connected);
     wait_for(&mut browser, "the role", |browser| browser.text("role").is_empty());
-    wait_for(&mut browser, "the buttons", has_controls);
-    for (action, state, label) in [(Control::Pause, "paused", "Continue"), (Control::Resume, "training", "Pause")] {
+    wait_for(&mut browser, "the button", |browser| browser.evaluate(is_shown) == json!(true));
+    for (action, state, next) in [(Control::Pause, "paused", "Continue"), (Control::Resume, "training", "Pause")] {
         browser.click("pause");
-        wait_for(&mut browser, "the request", |_| hub.take_controls().contains(&action));
+        wait_for(&mut browser, "the action", |_| hub.take_controls() == [action]);
         hub.set_state(state); // As the run does.
-        wait_for(&mut browser, "the state", |browser| browser.text("pause") == label);
+        wait_for(&mut browser, "the state", |browser| browser.text("pause") == next);
     }
     std::fs::write(scratch.join("shared-operator.png"), browser.screenshot()).expect("written");
     drop(browser);

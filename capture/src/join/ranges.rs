@@ -218,6 +218,13 @@ mod tests {
     }
 
     #[test]
+    fn newest_scans_come_in_order() {
+        let ranges = ranges_of((0..3).map(|ix| (Stamp(ix), wall())).collect());
+        let stamps = |n| ranges.newest(n).map(|scan| scan.stamp.0).collect::<Vec<_>>();
+        assert_eq!([stamps(0), stamps(2), stamps(7)], [vec![], vec![1, 2], vec![0, 1, 2]]);
+    }
+
+    #[test]
     fn scans_from_other_times_give_no_depth() {
         let ranges = ranges_of(vec![(Stamp(0), wall())]);
         assert!(ranges.depth_of(&keyframe(Stamp(1_000_000_000))).is_some());

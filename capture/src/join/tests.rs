@@ -116,6 +116,7 @@ fn run_join(join: &mut Join, samples: impl IntoIterator<Item = Sample>) -> JoinO
                 JoinEvent::Rejected { why } => outcome.rejected.push(why),
                 JoinEvent::Evicted { stamp, .. } => outcome.evicted.push(stamp.0),
                 JoinEvent::PosedImage(_) => outcome.n_posed += 1,
+                JoinEvent::RangeScan(_) => {}
             }
         }
     };

@@ -72,6 +72,14 @@ impl Persistence {
         Ok(())
     }
 
+    /// Logs that growth was paused or continued.
+    pub(super) fn log_growth_pause(&mut self, method: &mut dyn Method, is_paused: bool) -> crate::Result<()> {
+        if let Some(decisions) = &mut self.decisions {
+            decisions.growth_paused(method.n_total_steps()?, is_paused);
+        }
+        Ok(())
+    }
+
     /// Logs that a picture is drawn. Drawing affects the result, because it creates splats for new keyframes.
     pub(super) fn log_render(&mut self) {
         if let Some(decisions) = &mut self.decisions {

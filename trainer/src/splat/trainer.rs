@@ -359,6 +359,16 @@ impl Method for SplatTrainer {
         self.end_growth_search()
     }
 
+    fn pause_growth(&mut self, is_paused: bool) -> Result<bool, Error> {
+        let is_compared = self.trials.running_trial().is_some() || self.growth_search.running().is_some();
+        if self.model.is_growth_paused == is_paused || is_compared {
+            return Ok(false);
+        }
+        self.finish_in_flight()?; // A failed submit may reduce the step count.
+        self.model.is_growth_paused = is_paused;
+        Ok(true)
+    }
+
     fn progress(&self) -> Progress {
         let displayed = displayed(&self.growth_search, &self.trials, &self.model);
         Progress {

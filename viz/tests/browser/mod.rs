@@ -142,7 +142,7 @@ impl Browser {
             let mut message: Value = serde_json::from_str(&text).expect("JSON");
             match message["method"].as_str() {
                 Some("Tracing.dataCollected") => {
-                    events.extend(message["params"]["value"].as_array_mut().expect("events").drain(..));
+                    events.append(message["params"]["value"].as_array_mut().expect("events"));
                 }
                 Some("Tracing.tracingComplete") => break,
                 _ => {}

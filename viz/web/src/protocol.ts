@@ -37,7 +37,7 @@ export interface Hello {
   capabilities?: string[];
   server: string;
   client: number;
-  /** Older servers have no roles. */
+  /** Servers before the capability `control` have none. */
   role: Role | undefined;
   max_size_px: [number, number];
   default_stages: number[];

@@ -37,6 +37,8 @@ struct SavedState {
     /// Whether memory was too small for more splats.
     #[serde(default)]
     is_full: bool,
+    #[serde(default)]
+    is_growth_paused: bool,
     /// Training views. Their order determines the training order.
     views: Vec<KeyframeSignature>,
     /// Indices of the views that have not been seeded yet.
@@ -210,6 +212,7 @@ impl SplatTrainer {
             slots: cameras.slots(),
             remaining_trials: self.trials.remaining_trials(),
             is_full: self.model.is_full(),
+            is_growth_paused: self.model.is_growth_paused,
             finished_trials: self.trials.finished.clone(),
             growth_search: self.growth_search.saved(),
             trial: self.trials.running_trial().map(TrialState::of),
@@ -277,6 +280,7 @@ impl SplatTrainer {
         trainer.model.cameras.restore(gpu, &state.slots, state.model.params, checkpoint)?;
         trainer.trials.restore(state.remaining_trials, state.finished_trials);
         trainer.model.set_full(state.is_full);
+        trainer.model.is_growth_paused = state.is_growth_paused;
         trainer.growth_search.restore(state.growth_search);
         if let Some(trial) = state.trial {
             let n_planned_steps = trainer.options.common.n_planned_steps;

@@ -26,6 +26,8 @@ pub(super) struct TrainedModel {
     max_splats: u32,
     /// Whether the GPU has no memory left for more splats.
     is_full: bool,
+    /// Whether only new images add splats, because larger models would be too slow.
+    pub(super) is_growth_paused: bool,
 }
 
 impl TrainedModel {
@@ -36,6 +38,7 @@ impl TrainedModel {
             cameras: CameraParams::new(gpu, options.common.cameras.always())?,
             max_splats: options.cap(),
             is_full: false,
+            is_growth_paused: false,
         })
     }
 
@@ -72,7 +75,7 @@ impl TrainedModel {
         key: u32,
     ) -> Result<(), Error> {
         let n_before = self.splats.n_splats;
-        let n_more = if self.is_full { 0 } else { n_more };
+        let n_more = if self.is_full || self.is_growth_paused { 0 } else { n_more };
         let n_after = n_before.saturating_add(n_more).min(self.max_splats).max(n_before);
         let n_after = self.reserve_up_to(recorder, renderer, n_after)?.max(n_before);
         let growth = Growth {

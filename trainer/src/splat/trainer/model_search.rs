@@ -14,7 +14,11 @@ impl SplatTrainer {
         TrialContext {
             step: self.schedule.step,
             n_splats: self.model.splats.n_splats,
-            max_splats: if self.model.is_full() { self.model.splats.n_splats } else { self.options.cap() },
+            max_splats: if self.model.is_full() || self.model.is_growth_paused {
+                self.model.splats.n_splats
+            } else {
+                self.options.cap()
+            },
             n_planned_steps: self.options.common.n_planned_steps,
             is_mature: self.schedule.is_mature(),
             sh_degree: self.model.splats.sh_degree,
