@@ -261,7 +261,9 @@ fn several_live_methods_equal_single_runs() {
     let args = ["run", "rig.toml", "--from", "scan.mcap", "--method", "tsdf,splat"];
     let common = ["--steps-per-keyframe", "1", "--out", "viewed", "--listen", "127.0.0.1:0", "--json"];
     let printed = interrupted(folder, &[&args[..], &common].concat(), |serving| {
-        request_picture_of_each_method(serving["url"].as_str().expect("an address"));
+        let url = serving["url"].as_str().expect("an address");
+        request_picture_of_each_method(url);
+        pause_and_continue(url);
     });
     assert_eq!(printed.iter().filter(|event| event["event"] == "done").count(), 2);
 }
