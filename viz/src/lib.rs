@@ -14,6 +14,8 @@
 
 mod admission;
 mod broadcast;
+mod chunk_list;
+mod chunk_sender;
 mod client_updates;
 mod clock;
 mod compact_depth;

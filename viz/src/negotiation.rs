@@ -3,8 +3,17 @@
 use crate::protocol::{BASE_PROTOCOL_VERSION, ClientHello, PROTOCOL_VERSION};
 
 /// Names of the capabilities of this server.
-pub(crate) const CAPABILITIES: [&str; 8] =
-    ["views", "subscribe", "compact_depth", KEYFRAME_CHANGES, PARTS, HEARTBEAT, "robot", "keyframe_points"];
+pub(crate) const CAPABILITIES: [&str; 9] = [
+    "views",
+    "subscribe",
+    "compact_depth",
+    KEYFRAME_CHANGES,
+    PARTS,
+    HEARTBEAT,
+    "robot",
+    "keyframe_points",
+    "model_chunks",
+];
 const KEYFRAME_CHANGES: &str = "keyframe_changes";
 const PARTS: &str = "parts";
 const HEARTBEAT: &str = "heartbeat";

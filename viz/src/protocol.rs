@@ -60,6 +60,8 @@ pub(crate) enum Topic {
     RobotState,
     /// Points of each keyframe.
     KeyframePoints,
+    /// Chunks of a model, for clients that draw it themselves.
+    ModelChunks,
 }
 
 /// Fields of `subscribe`.
@@ -74,6 +76,10 @@ pub(crate) struct SubscribeMessage {
     pub(crate) camera: Option<String>,
     /// Maximum size of images.
     pub(crate) size_px: Option<[u32; 2]>,
+    /// The model whose chunks are sent.
+    pub(crate) method: Option<String>,
+    /// Maximum rate of changed chunks.
+    pub(crate) max_bytes_per_sec: Option<f64>,
 }
 
 /// Fields of `ping`.

@@ -6,6 +6,7 @@ use crate::protocol::{DepthFormat, ProjectionMessage};
 use crate::robot::{RobotMessage, RobotStateMessage};
 use crate::updates::{KeyframePose, LiveImage, SceneHint, Status};
 use serde::Serialize;
+use trainer::ChunkLayout;
 
 /// JSON text messages from the server.
 #[derive(Debug, Serialize)]
@@ -36,6 +37,8 @@ pub(crate) enum ServerMessage<'a> {
     Robot(&'a RobotMessage<'a>),
     /// Joint positions and base pose of the robot.
     RobotState(RobotStateMessage),
+    /// Chunks of a model that no longer exist.
+    ModelChunksRemoved { method: &'a str, ids: Vec<u64> },
     /// Reason why a message was invalid or a picture failed.
     Error {
         id: Option<u64>,
@@ -109,6 +112,8 @@ pub(crate) enum BinaryHeader<'a> {
     LiveImage(&'a LiveHeader<'a>),
     /// Points of a keyframe.
     KeyframePoints(PointsHeader),
+    /// A chunk of a model.
+    ModelChunk(ChunkHeader<'a>),
     /// A part of a binary message.
     Part(PartHeader),
 }
@@ -119,6 +124,19 @@ pub(crate) struct PointsHeader {
     pub(crate) id: u64,
     pub(crate) n_points: usize,
     pub(crate) meters_per_count: f64,
+}
+
+/// Header of `model_chunk`.
+#[derive(Clone, Copy, Debug, Serialize)]
+pub(crate) struct ChunkHeader<'a> {
+    pub(crate) method: &'a str,
+    pub(crate) id: u64,
+    pub(crate) is_coarse: bool,
+    pub(crate) n_chunks: usize,
+    pub(crate) n_incomplete: usize,
+    pub(crate) world_from_model: [f64; 16],
+    #[serde(flatten)]
+    pub(crate) layout: ChunkLayout,
 }
 
 /// Header of `part`.

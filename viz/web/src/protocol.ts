@@ -14,6 +14,7 @@ export const CAPABILITIES = [
   "heartbeat",
   "robot",
   "keyframe_points",
+  "model_chunks",
 ] as const;
 export type Capability = (typeof CAPABILITIES)[number];
 
@@ -51,6 +52,8 @@ export interface ModelStatus {
   primitives: number;
   primitives_label: string;
   bytes: number;
+  /** Whether the page can draw the model itself; absent on older servers. */
+  has_chunks?: boolean;
   psnr: number | null;
   psnr_history: [number, number][];
 }
@@ -226,6 +229,49 @@ export interface KeyframePointsHeader {
   meters_per_count: number;
 }
 
+interface ChunkHeader {
+  type: "model_chunk";
+  /** The model. */
+  method: string;
+  id: number;
+  /** Whether the chunk is only an approximation. */
+  is_coarse: boolean;
+  /** Number of chunks of the model, and of those that are missing or coarse after this message. */
+  n_chunks: number;
+  n_incomplete: number;
+  world_from_model: number[];
+}
+
+/** A part of a mesh. */
+export interface MeshChunkHeader extends ChunkHeader {
+  kind: "mesh";
+  origin_m: [number, number, number];
+  meters_per_count: number;
+  n_vertices: number;
+  n_triangles: number;
+}
+
+/** Gaussian splats in a box. */
+export interface SplatChunkHeader extends ChunkHeader {
+  kind: "splats";
+  n_splats: number;
+  min_m: [number, number, number];
+  max_m: [number, number, number];
+  log_scale_range: [number, number];
+  scale_factor: number;
+  sh_degree: number;
+  sh_ranges: [number, number];
+}
+
+export type ModelChunkHeader = MeshChunkHeader | SplatChunkHeader;
+
+/** Chunks that no longer exist. */
+export interface ModelChunksRemoved {
+  type: "model_chunks_removed";
+  method: string;
+  ids: number[];
+}
+
 /** A part of a binary message that is `bytes` long. */
 export interface PartHeader {
   type: "part";
@@ -243,11 +289,12 @@ export type TextMessage =
   | KeyframeChanges
   | Robot
   | RobotState
+  | ModelChunksRemoved
   | ErrorMessage
   | Heartbeat
   | Pong
   | Goodbye;
-export type BinaryHeader = PictureHeader | LiveImageHeader | KeyframePointsHeader;
+export type BinaryHeader = PictureHeader | LiveImageHeader | KeyframePointsHeader | ModelChunkHeader;
 
 export interface HelloMessage {
   type: "hello";
@@ -257,10 +304,11 @@ export interface HelloMessage {
 
 export interface SubscribeMessage {
   type: "subscribe";
-  topic: "status" | "keyframes" | "live_images" | "robot_state" | "keyframe_points";
+  topic: "status" | "keyframes" | "live_images" | "robot_state" | "keyframe_points" | "model_chunks";
   rate_hz: number;
   camera?: string;
   size_px?: [number, number];
+  method?: string;
 }
 
 export interface RenderMessage {

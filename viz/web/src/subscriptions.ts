@@ -10,6 +10,8 @@ const IMAGES_HZ = 4;
 const ROBOT_HZ = 60;
 /** Keyframes whose points are sent per second, 22 kB each. */
 const POINTS_HZ = 20;
+/** Versions of the model per second, if the page draws it. */
+const CHUNKS_HZ = 1;
 /** Rate of the status, which the title bar needs, while the page is hidden. */
 const HIDDEN_STATUS_HZ = 0.5;
 /** Limits of the height of camera images, in CSS pixels: see `.live canvas` in app.css. */
@@ -25,6 +27,7 @@ export class Subscriptions {
   private readonly sent = new Map<SubscribeMessage["topic"], string>();
   private resizeTimer = 0;
   private showsPoints = false;
+  private drawnMethod: string | null = null;
 
   constructor(private readonly connection: Connection) {
     document.addEventListener("visibilitychange", () => this.update());
@@ -43,6 +46,12 @@ export class Subscriptions {
   /** Whether the points of keyframes are shown. */
   set points(shown: boolean) {
     this.showsPoints = shown;
+    this.update();
+  }
+
+  /** The model that the page draws; null if the server draws it. */
+  set localModel(method: string | null) {
+    this.drawnMethod = method;
     this.update();
   }
 
@@ -75,6 +84,12 @@ export class Subscriptions {
     if (this.connection.supports("keyframe_points")) {
       messages.push({ type: "subscribe", topic: "keyframe_points", rate_hz: this.showsPoints ? POINTS_HZ : 0 });
     }
+    if (this.connection.supports("model_chunks")) {
+      const chunks = { type: "subscribe", topic: "model_chunks" } as const;
+      messages.push(
+        this.drawnMethod ? { ...chunks, rate_hz: CHUNKS_HZ, method: this.drawnMethod } : { ...chunks, rate_hz: 0 },
+      );
+    }
     return messages;
   }
 
@@ -84,7 +99,12 @@ export class Subscriptions {
       { type: "subscribe", topic: "keyframes", rate_hz: 0 },
       { type: "subscribe", topic: "live_images", rate_hz: 0 },
     ];
-    for (const [capability, topic] of [["robot", "robot_state"], ["keyframe_points", "keyframe_points"]] as const) {
+    const optional = [
+      ["robot", "robot_state"],
+      ["keyframe_points", "keyframe_points"],
+      ["model_chunks", "model_chunks"],
+    ] as const;
+    for (const [capability, topic] of optional) {
       if (this.connection.supports(capability)) messages.push({ type: "subscribe", topic, rate_hz: 0 });
     }
     return messages;
