@@ -10,8 +10,10 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-/// The budget saves up for at most this time, and new chunks exceed it by at most this time.
-const MAX_BALANCE: Duration = Duration::from_secs(1);
+/// Unused budget is saved for at most this time, seconds.
+const MAX_SAVED_SECS: f64 = 0.1;
+/// New chunks may exceed the budget. Changes make up for at most this time, seconds.
+const MAX_DEBT_SECS: f64 = 1.0;
 
 /// What a client has of a model.
 #[derive(Debug, Default)]
@@ -88,7 +90,7 @@ impl ChunkSender {
     fn refill(&mut self, bytes_per_sec: f64, now: Instant) {
         let secs = self.updated.map_or(0.0, |updated| (now - updated).as_secs_f64());
         self.updated = Some(now);
-        self.balance_bytes = (self.balance_bytes + secs * bytes_per_sec).min(0.1 * bytes_per_sec);
+        self.balance_bytes = (self.balance_bytes + secs * bytes_per_sec).min(MAX_SAVED_SECS * bytes_per_sec);
     }
 
     fn send(
@@ -112,8 +114,8 @@ impl ChunkSender {
             layout: data.layout,
         };
         let bytes = frame(&BinaryHeader::ModelChunk(header), &[&data.bytes]);
-        let max_debt = MAX_BALANCE.as_secs_f64() * subscription.max_bytes_per_sec;
-        self.balance_bytes = (self.balance_bytes - bytes.len() as f64).max(-max_debt);
+        let max_debt_bytes = MAX_DEBT_SECS * subscription.max_bytes_per_sec;
+        self.balance_bytes = (self.balance_bytes - bytes.len() as f64).max(-max_debt_bytes);
         NextChunk::Send(Message::binary(bytes))
     }
 }

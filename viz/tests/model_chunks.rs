@@ -126,16 +126,22 @@ fn changes_arrive_and_the_copy_equals_the_model() {
     hub.set_model_chunks("tsdf", model.queue_chunks(true).expect("queued").expect("chunks").finish().expect("encoded"));
     replica.receive_all(&mut client);
     let n_first = replica.chunks.len();
-    for keyframe in keyframe::scenes::ring(&[keyframe::scenes::floor()], nalgebra::Point3::origin(), 20) {
-        model.push(keyframe).expect("a keyframe");
-        while !model.is_idle() {
-            model.step(1).expect("fused");
+    let publisher = std::thread::spawn(move || {
+        for keyframe in keyframe::scenes::ring(&[keyframe::scenes::floor()], nalgebra::Point3::origin(), 12) {
+            model.push(keyframe).expect("a keyframe");
+            while !model.is_idle() {
+                model.step(1).expect("fused");
+            }
+            let changes = model.queue_chunks(true).expect("queued").expect("chunks").finish().expect("encoded");
+            assert!(!changes.is_complete);
+            hub.set_model_chunks("tsdf", changes);
         }
-        let changes = model.queue_chunks(true).expect("queued").expect("chunks").finish().expect("encoded");
-        assert!(!changes.is_complete);
-        hub.set_model_chunks("tsdf", changes);
+        all_chunks(&mut model)
+    });
+    while !publisher.is_finished() {
+        replica.apply(client.receive());
     }
-    let expected = all_chunks(&mut model);
+    let expected = publisher.join().expect("no panic");
     assert_ne!(expected.chunks.len(), n_first);
     let is_equal = |replica: &Replica| {
         replica.chunks.len() == expected.chunks.len()

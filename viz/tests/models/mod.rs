@@ -55,16 +55,19 @@ pub(crate) fn tsdf_model(n_keyframes: usize) -> TsdfModel {
 
 /// Models by method, and the requests so far.
 pub(crate) struct ModelThread {
-    requests: Arc<Mutex<Vec<RenderRequest>>>,
+    requests: Arc<Mutex<Vec<ReceivedRequest>>>,
     stop: Arc<AtomicBool>,
     thread: Option<std::thread::JoinHandle<Models>>,
 }
+
+/// A request, and whether it asks for colors.
+type ReceivedRequest = (RenderRequest, bool);
 
 pub(crate) type Models = Vec<(&'static str, Box<dyn Method + Send>)>;
 
 impl ModelThread {
     pub(crate) fn start(hub: Hub, models: Models) -> Self {
-        let requests: Arc<Mutex<Vec<RenderRequest>>> = Arc::default();
+        let requests: Arc<Mutex<Vec<ReceivedRequest>>> = Arc::default();
         let stop: Arc<AtomicBool> = Arc::default();
         let (received, stopped) = (Arc::clone(&requests), Arc::clone(&stop));
         let thread = std::thread::spawn(move || serve(&hub, models, &received, &stopped));
@@ -73,11 +76,12 @@ impl ModelThread {
 
     /// The newest request.
     pub(crate) fn last_request(&self) -> RenderRequest {
-        self.requests.lock().expect("no panic").last().expect("a picture was requested").clone()
+        self.requests.lock().expect("no panic").last().expect("a picture was requested").0.clone()
     }
 
-    pub(crate) fn n_requests(&self) -> usize {
-        self.requests.lock().expect("no panic").len()
+    /// Number of requests for colors.
+    pub(crate) fn n_color_requests(&self) -> usize {
+        self.requests.lock().expect("no panic").iter().filter(|(_, has_color)| *has_color).count()
     }
 
     /// Ends the thread.
@@ -87,11 +91,12 @@ impl ModelThread {
     }
 }
 
-fn serve(hub: &Hub, mut models: Models, requests: &Mutex<Vec<RenderRequest>>, stop: &AtomicBool) -> Models {
+fn serve(hub: &Hub, mut models: Models, requests: &Mutex<Vec<ReceivedRequest>>, stop: &AtomicBool) -> Models {
     while !stop.load(Ordering::Relaxed) {
         hub.wait_for_request(Duration::from_millis(20));
         if let Some(pending) = hub.next_request() {
-            requests.lock().expect("no panic").push(pending.request.clone());
+            let has_color = pending.packing().is_none_or(|packing| packing.jpeg_quality.is_some());
+            requests.lock().expect("no panic").push((pending.request.clone(), has_color));
             let name = pending.method().unwrap_or(models[0].0).to_owned();
             match models.iter_mut().find(|(other, _)| *other == name) {
                 Some((_, model)) => {

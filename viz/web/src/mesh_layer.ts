@@ -2,6 +2,7 @@
 
 import * as THREE from "three";
 import type { Crop } from "./crop_box";
+import { SOLID } from "./occlusion";
 import type { MeshChunkHeader } from "./protocol";
 import { inflated } from "./zlib";
 
@@ -10,9 +11,21 @@ const BYTES_PER_VERTEX = 9;
 export class MeshLayer {
   readonly root = new THREE.Group();
   private readonly planes: THREE.Plane[] = [];
-  /** Like the server, draws surface colors without shading, and only the observed side. */
-  private readonly material = new THREE.MeshBasicMaterial({ vertexColors: true, clippingPlanes: this.planes });
+  private readonly material: THREE.MeshBasicMaterial;
   private readonly chunks = new Map<number, THREE.Mesh>();
+
+  constructor() {
+    // Like the server, draws surface colors without shading, and only the observed side.
+    this.material = new THREE.MeshBasicMaterial({ vertexColors: true, clippingPlanes: this.planes });
+    // The depth is increased by the tolerance of occlusion, so that objects on the surface are not hidden.
+    const factor = `1.0 + ${SOLID.relative} - ${SOLID.meters} / mvPosition.z`;
+    this.material.onBeforeCompile = (shader) => {
+      shader.vertexShader = shader.vertexShader.replace(
+        "#include <project_vertex>",
+        `#include <project_vertex>\n  gl_Position = projectionMatrix * vec4(mvPosition.xyz * (${factor}), 1.0);`,
+      );
+    };
+  }
 
   /** Adds a chunk or replaces its older version. Decodes it first; `isCurrent` says whether it is still wanted then. */
   async set(header: MeshChunkHeader, payload: Uint8Array<ArrayBuffer>, isCurrent: () => boolean): Promise<void> {

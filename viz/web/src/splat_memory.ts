@@ -99,9 +99,12 @@ function grown(from: THREE.DataTexture, to: THREE.DataTexture): THREE.DataTextur
   return to;
 }
 
+/** Stores the splats of a unit. The rest of it is transparent. */
 function writeWords(texture: THREE.DataTexture, unit: number, words: Uint32Array): void {
-  (texture.image.data as Uint32Array).set(words, UNIT_WORDS * unit);
-  updateRange(texture, UNIT_WORDS * unit, words.length);
+  const [data, begin] = [texture.image.data as Uint32Array, UNIT_WORDS * unit];
+  data.set(words, begin);
+  data.fill(0, begin + words.length, begin + UNIT_WORDS);
+  updateRange(texture, begin, UNIT_WORDS);
 }
 
 /** Uploads only this range. The ranges of a texture that is new are uploaded together with it. */

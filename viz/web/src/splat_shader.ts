@@ -13,6 +13,7 @@ export const UNIT_TEXELS = 3;
 export const SPLAT_VERTEX = /* glsl */ `
   precision highp float;
   precision highp int;
+  precision highp sampler2D;
   precision highp usampler2D;
   uniform usampler2D base;      // mean, scale, rotation, opacity and color
   uniform usampler2D harmonics; // color coefficients of degree 1 and 2, six of 5 bits in each word
