@@ -8,7 +8,7 @@ use viz::Hub;
 
 /// Minimum time between two versions of a model, because each one is read from the GPU and encoded as a whole.
 const MIN_PERIOD: Duration = Duration::from_millis(500);
-/// Maximum fraction of the time that one CPU core spends on encoding.
+/// Maximum fraction of the time that encoding takes.
 const MAX_ENCODE_FRAC: f64 = 0.25;
 
 /// Encodes chunks on another thread, one model at a time.

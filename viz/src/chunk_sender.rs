@@ -113,7 +113,7 @@ impl ChunkSender {
             world_from_model: row_major(&list.world_from_model),
             layout: data.layout,
         };
-        let bytes = frame(&BinaryHeader::ModelChunk(header), &[&data.bytes]);
+        let bytes = frame(&BinaryHeader::ModelChunk(&header), &[&data.bytes]);
         let max_debt_bytes = MAX_DEBT_SECS * subscription.max_bytes_per_sec;
         self.balance_bytes = (self.balance_bytes - bytes.len() as f64).max(-max_debt_bytes);
         NextChunk::Send(Message::binary(bytes))

@@ -113,7 +113,7 @@ pub(crate) enum BinaryHeader<'a> {
     /// Points of a keyframe.
     KeyframePoints(PointsHeader),
     /// A chunk of a model.
-    ModelChunk(ChunkHeader<'a>),
+    ModelChunk(&'a ChunkHeader<'a>),
     /// A part of a binary message.
     Part(PartHeader),
 }

@@ -83,7 +83,8 @@ fn local_drawing_equals_the_pictures_of_the_server() {
     let status = |method: &str| ModelStatus { method: method.to_owned(), has_chunks: true, ..ModelStatus::default() };
     let nerf = ModelStatus { method: "nerf".to_owned(), ..ModelStatus::default() };
     hub.set_status(Status { model: status("splat"), others: vec![status("tsdf"), nerf], ..Status::default() });
-    let splats = wall(20_000);
+    // More than the page reserves memory for at first.
+    let splats = wall(80_000);
     let models: models::Models = vec![("splat", Box::new(splat_model(&splats))), ("tsdf", Box::new(tsdf_model(18)))];
     let (mut reference_splats, mut reference_tsdf) = (splat_model(&splats), tsdf_model(18));
     let thread = ModelThread::start(hub.clone(), models);

@@ -84,6 +84,7 @@ export class SplatLayer {
 
   clear(): void {
     for (const id of [...this.units.keys()]) this.remove(id);
+    this.mesh.geometry.instanceCount = 0;
   }
 
   /** Draws only splats with their center in a box. */
@@ -127,6 +128,7 @@ export class SplatLayer {
 
   private adopt({ order }: SortResult): void {
     this.isSorting = false;
+    if (this.units.size === 0) return; // The order is for splats that are gone.
     const { geometry } = this.mesh;
     let slots = geometry.getAttribute("slot") as THREE.InstancedBufferAttribute | undefined;
     if (!slots || slots.count < order.length) {
