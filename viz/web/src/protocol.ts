@@ -52,8 +52,8 @@ export interface ModelStatus {
   primitives: number;
   primitives_label: string;
   bytes: number;
-  /** Whether the page can draw the model itself; absent on older servers. */
-  has_chunks?: boolean;
+  /** Whether the page can draw the model itself; missing on older servers. */
+  has_chunks: boolean;
   psnr: number | null;
   psnr_history: [number, number][];
 }

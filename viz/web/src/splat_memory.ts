@@ -82,15 +82,12 @@ function splatTexture(nRows: number): THREE.DataTexture {
   const data = new Uint32Array(WORDS_PER_SPLAT * ROW_SPLATS * nRows);
   const texture = new THREE.DataTexture(data, ROW_SPLATS, nRows, THREE.RGBAIntegerFormat, THREE.UnsignedIntType);
   texture.internalFormat = "RGBA32UI";
-  texture.needsUpdate = true;
-  return texture;
+  return marked(texture);
 }
 
 function unitTexture(nRows: number): THREE.DataTexture {
   const data = new Float32Array(UNIT_FLOATS * ROW_UNITS * nRows);
-  const texture = new THREE.DataTexture(data, ROW_UNITS * UNIT_TEXELS, nRows, THREE.RGBAFormat, THREE.FloatType);
-  texture.needsUpdate = true;
-  return texture;
+  return marked(new THREE.DataTexture(data, ROW_UNITS * UNIT_TEXELS, nRows, THREE.RGBAFormat, THREE.FloatType));
 }
 
 function grown(from: THREE.DataTexture, to: THREE.DataTexture): THREE.DataTexture {
@@ -107,8 +104,15 @@ function writeWords(texture: THREE.DataTexture, unit: number, words: Uint32Array
   updateRange(texture, begin, UNIT_WORDS);
 }
 
-/** Uploads only this range. The ranges of a texture that is new are uploaded together with it. */
+/** Uploads only this range, or everything if the texture is new. */
 function updateRange(texture: THREE.DataTexture, start: number, count: number): void {
-  texture.addUpdateRange(start, count);
+  if (texture.userData.isUploaded === true) texture.addUpdateRange(start, count);
   texture.needsUpdate = true;
+}
+
+/** Marks a texture for upload. */
+function marked(texture: THREE.DataTexture): THREE.DataTexture {
+  texture.onUpdate = () => (texture.userData.isUploaded = true);
+  texture.needsUpdate = true;
+  return texture;
 }
