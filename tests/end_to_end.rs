@@ -364,6 +364,26 @@ fn request_picture_of_each_method(url: &str) {
     assert!(tsdf.is_array() && splat.is_array() && splat != tsdf, "the models look different");
     let printed = request_picture(202, Some("nerf"))["message"].as_str().expect("an error").to_owned();
     assert!(printed.contains("\"nerf\"") && printed.contains("tsdf or splat"), "{printed}");
+    for method in ["splat", "tsdf"] {
+        receive_model(&mut socket, method);
+    }
+}
+
+/// Receives all chunks of a model in training.
+fn receive_model(socket: &mut tungstenite::WebSocket<std::net::TcpStream>, method: &str) {
+    let message = serde_json::json!({"type": "subscribe", "topic": "model_chunks", "rate_hz": 2, "method": method});
+    socket.send(tungstenite::Message::text(message.to_string())).expect("sent");
+    loop {
+        let tungstenite::Message::Binary(bytes) = socket.read().expect("a message") else { continue };
+        let n_header = u32::from_le_bytes(bytes[..4].try_into().expect("4 bytes")) as usize;
+        let header: Value = serde_json::from_slice(&bytes[4..4 + n_header]).expect("JSON");
+        if header["type"] == "model_chunk" {
+            assert_eq!(header["method"], method);
+            if header["n_incomplete"] == 0 {
+                return;
+            }
+        }
+    }
 }
 
 /// Checks that `eval` of the saved model gives the same score as `run`.

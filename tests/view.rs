@@ -132,6 +132,28 @@ impl Client {
     }
 }
 
+/// Headers of all chunks of a model, in full.
+fn chunks(client: &mut Client, method: &str) -> Vec<Value> {
+    let message = json!({"type": "subscribe", "topic": "model_chunks", "rate_hz": 1, "method": method});
+    client.socket.send(Message::text(message.to_string())).expect("sent");
+    let mut fine = Vec::new();
+    loop {
+        let (header, payload) = client.receive();
+        if header["type"] == "model_chunk" && header["is_coarse"] == false {
+            assert!(header["method"] == method && !payload.is_empty(), "{header}");
+            let is_last = header["n_incomplete"] == 0;
+            fine.push(header);
+            if is_last {
+                return fine;
+            }
+        }
+    }
+}
+
+fn sum_of(chunks: &[Value], field: &str) -> u64 {
+    chunks.iter().map(|chunk| chunk[field].as_u64().expect("a number")).sum()
+}
+
 fn pose_of(message: &Value) -> Vec<f64> {
     let pose = message["world_from_camera"].as_array().expect("a pose");
     pose.iter().map(|number| number.as_f64().expect("a number")).collect()
@@ -197,6 +219,12 @@ fn view_matches_render() {
         assert!(brightness(&received) > 30.0, "{method}: the picture is dark");
     }
     assert_eq!(client.request_picture(&start, None), client.request_picture(&start, Some("splat")));
+    let have_chunks = status["others"].as_array().expect("a list").iter().map(|model| model["has_chunks"].clone());
+    assert!(status["has_chunks"] == true && have_chunks.eq([json!(true), json!(false)]), "{status}");
+    let n_splats = sum_of(&chunks(&mut client, "splat"), "n_splats");
+    let n_all = status["primitives"].as_u64().expect("a number");
+    assert!(n_splats <= n_all && 2 * n_splats > n_all, "{n_splats} of {n_all} splats are visible");
+    assert!(sum_of(&chunks(&mut client, "tsdf"), "n_triangles") > 1000);
     let refused = client.request_picture(&start, Some("mesh")).expect_err("no such model");
     assert!(refused.contains("\"mesh\"") && refused.contains("splat or tsdf or nerf"), "{refused}");
     assert_eq!(view.interrupt().code(), Some(0));
@@ -231,6 +259,13 @@ fn check_view_without_cameras(folder: &Path) {
             let expected = rendered(folder, model, &in_model, "picture-turned");
             let difference = difference(&received, &expected);
             assert!(difference < MAX_JPEG_DIFFERENCE, "{difference}");
+            let [x, y, z] = [[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]];
+            let page_from_model = [x, y, z, [0, 0, 0, 1]].concat();
+            for chunk in chunks(&mut client, "splat") {
+                let differs = |(a, b): (&f64, &i32)| (a - f64::from(*b)).abs() > 1e-9;
+                let pose = chunk["world_from_model"].as_array().expect("a pose").iter().filter_map(Value::as_f64);
+                assert!(!pose.collect::<Vec<_>>().iter().zip(&page_from_model).any(differs), "{chunk}");
+            }
         }
         assert_eq!(view.interrupt().code(), Some(0));
     }

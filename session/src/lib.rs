@@ -24,6 +24,7 @@ pub mod camera_list;
 pub mod camera_path;
 pub mod chart;
 pub mod checkpoints;
+mod chunk_publisher;
 mod clock;
 pub mod corrected_rig;
 mod data;

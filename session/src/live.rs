@@ -1,5 +1,6 @@
 //! The loop of a live run: takes keyframes, trains models, and draws pictures for viewers.
 
+use crate::chunk_publisher::ChunkPublisher;
 use crate::ledger::{KeyframeTimes, Ledger};
 use crate::recoveries::{self, OpenGpu, Recoveries};
 use crate::render_budget::RenderBudget;
@@ -79,6 +80,7 @@ pub struct Live {
     is_paused: bool,
     /// Result of the last checkpoint that an operator requested.
     checkpoint_note: Option<String>,
+    chunk_publisher: ChunkPublisher,
 }
 
 /// Changes a keyframe before the models receive it.
@@ -92,6 +94,7 @@ impl Live {
             next_keyframe_at: vec![0; sessions.len()],
             sessions,
             feed,
+            chunk_publisher: ChunkPublisher::new(hub.clone()),
             hub,
             pace: options.pace,
             start_keyframes: options.start_keyframes,
@@ -213,6 +216,7 @@ impl Live {
             .and_then(|()| self.take_keyframes())
             .and_then(|()| self.step())
             .and_then(|()| self.render())
+            .and_then(|()| self.publish_chunks())
             .and_then(|()| self.publish());
         advanced.or_else(|error| self.recoveries.recover(&mut self.sessions, error))
     }
@@ -455,6 +459,16 @@ impl Live {
         }
     }
 
+    /// Publishes the models that clients draw themselves. Pictures and chunks share one budget.
+    fn publish_chunks(&mut self) -> crate::Result<()> {
+        if !self.is_scoring() && self.budget.may_render() {
+            for session in &mut self.sessions {
+                self.budget.add_render(session.publish_chunks(&mut self.chunk_publisher)?);
+            }
+        }
+        Ok(())
+    }
+
     /// Publishes the status of the run to viewers, a few times per second.
     fn publish(&mut self) -> crate::Result<()> {
         if self.published.is_some_and(|published| published.elapsed() < PUBLISH_PERIOD) {
@@ -620,6 +634,7 @@ fn model_status(session: &Session) -> ModelStatus {
         primitives: progress.primitives,
         primitives_label: session.kind().entry().primitives_label.to_owned(),
         bytes: progress.bytes,
+        has_chunks: session.kind().entry().has_chunks,
         psnr: session.psnr(),
         psnr_history: session.psnr_history().to_vec(),
     }

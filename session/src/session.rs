@@ -14,6 +14,7 @@ pub use scoreboard::Evaluators;
 pub use training_time::Limits;
 
 use crate::checkpoints::{Checkpoints, Snapshot};
+use crate::chunk_publisher::ChunkPublisher;
 use crate::clock::Clock;
 use crate::decisions::DecisionLog;
 use crate::evaluate::Evaluator;
@@ -220,6 +221,11 @@ impl Session {
             (None, Some(packing)) => self.method.render_packed(request, packing),
             (None, None) => self.method.render(request).map(Rendered::Picture),
         }
+    }
+
+    /// Publishes the chunks of the model if they are due. Returns the time spent.
+    pub(crate) fn publish_chunks(&mut self, publisher: &mut ChunkPublisher) -> crate::Result<Duration> {
+        Ok(publisher.publish(self.kind(), self.method.as_mut())?)
     }
 
     /// Waits for queued work and returns the total number of updates, including those of trials.

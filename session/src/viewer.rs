@@ -1,5 +1,6 @@
 //! Draws trained models for viewers: the loop of `view`, and of a run after its training.
 
+use crate::chunk_publisher::ChunkPublisher;
 use capture::Stop;
 use kinematics::Transform;
 use std::time::Duration;
@@ -22,6 +23,7 @@ pub struct ModelViewer {
     /// The first model is drawn for requests that name no method.
     models: Vec<ServedModel>,
     hub: Hub,
+    chunk_publisher: ChunkPublisher,
     /// Pose of the page's world, which is z up, in the model's world.
     model_from_page: Transform,
 }
@@ -29,11 +31,13 @@ pub struct ModelViewer {
 impl ModelViewer {
     /// A viewer of models whose z axis points up.
     pub fn new(models: Vec<ServedModel>, hub: Hub) -> Self {
-        Self { models, hub, model_from_page: Transform::identity() }
+        let chunk_publisher = ChunkPublisher::new(hub.clone());
+        Self { models, hub, chunk_publisher, model_from_page: Transform::identity() }
     }
 
     /// Rotates the models so that they are upright in the page's world, which is z up.
     pub fn with_model_from_page(self, model_from_page: Transform) -> Self {
+        self.hub.set_world_from_model(model_from_page.inverse());
         Self { model_from_page, ..self }
     }
 
@@ -44,6 +48,15 @@ impl ModelViewer {
                 && let Some(pending) = self.hub.next_request()
             {
                 self.answer(pending);
+            }
+            self.publish_chunks();
+        }
+    }
+
+    fn publish_chunks(&mut self) {
+        for ServedModel { kind, method } in &mut self.models {
+            if let Err(error) = self.chunk_publisher.publish(*kind, method.as_mut()) {
+                log::error!("cannot send the model to viewers: {error}");
             }
         }
     }

@@ -175,6 +175,7 @@ fn model_status(model: &Path, kind: ModelKind, progress: &Progress) -> ModelStat
         primitives: progress.primitives,
         primitives_label: kind.entry().primitives_label.to_owned(),
         bytes: progress.bytes,
+        has_chunks: kind.entry().has_chunks,
         psnr: done["psnr"].as_f64(),
         psnr_history: evaluations.into_iter().flatten().chain([done]).filter_map(point).collect(),
     }

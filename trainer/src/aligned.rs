@@ -8,6 +8,7 @@
 
 use crate::checkpoint::{Checkpoint, PendingCheckpoint};
 use crate::gpu::{Gpu, PassTiming};
+use crate::model_chunks::PendingChunks;
 use crate::model_metadata::{METADATA_FILE, read_metadata};
 use crate::model_options::{AlignTiming, CommonOptions};
 use crate::{Bounds, Error, Method, Packing, Picture, Progress, QueuedPicture, RenderRequest, Rendered};
@@ -445,6 +446,10 @@ impl<M: Recalibrate + 'static> Method for Aligned<M> {
 
     fn queue_packed(&mut self, request: &RenderRequest, packing: Packing) -> Result<QueuedPicture, Error> {
         self.model.queue_packed(request, packing)
+    }
+
+    fn queue_chunks(&mut self, only_changed: bool) -> Result<Option<PendingChunks>, Error> {
+        self.model.queue_chunks(only_changed)
     }
 
     fn set_watched(&mut self, watched: bool) {

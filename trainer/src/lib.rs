@@ -24,6 +24,7 @@ pub mod method;
 pub mod method_entry;
 #[cfg(test)]
 mod mismatches;
+mod model_chunks;
 mod model_metadata;
 mod model_options;
 mod model_spec;
@@ -53,6 +54,7 @@ pub use bounds::Bounds;
 pub use error::Error;
 pub use failed_model::FailedModel;
 pub use method::{Method, Progress};
+pub use model_chunks::{ChunkData, ChunkLayout, ModelChunk, ModelChunks, PendingChunks};
 pub use model_options::{AlignTiming, CommonOptions, MethodOptions, ModelOptions};
 pub use model_spec::{LoadedModel, ModelSpec, Resumed, load, resume};
 pub use packing::{JPEG_QUALITY, PackedDepth, PackedPicture, Packing, QueuedPicture, Rendered};

@@ -3,6 +3,7 @@
 use crate::bounds::Bounds;
 use crate::checkpoint::PendingCheckpoint;
 use crate::gpu::PassTiming;
+use crate::model_chunks::PendingChunks;
 use crate::{Error, Packing, Picture, QueuedPicture, RenderRequest, Rendered};
 use calibration::{Alignment, CalibratedCamera, CameraCorrection, TrialReport};
 use keyframe::Keyframe;
@@ -71,6 +72,14 @@ pub trait Method {
     /// Starts [`Method::render_packed`] without waiting for the GPU, if the model supports this.
     fn queue_packed(&mut self, request: &RenderRequest, packing: Packing) -> Result<QueuedPicture, Error> {
         self.render_packed(request, packing).map(QueuedPicture::ready)
+    }
+    /// Starts to encode the model for clients that draw it themselves. With `only_changed`, only the chunks that have
+    /// changed since the last call are encoded. Later training does not affect the result. Waiting for the GPU and
+    /// encoding take place in [`PendingChunks::finish`].
+    ///
+    /// `None` if the model is empty or if [`MethodEntry::has_chunks`](crate::method_entry::MethodEntry) is false.
+    fn queue_chunks(&mut self, _only_changed: bool) -> Result<Option<PendingChunks>, Error> {
+        Ok(None)
     }
     /// PSNR of the requested picture against a keyframe's image of the same size, dB, computed on the GPU.
     /// Bit-identical to [`crate::eval::psnr`] of the 8-bit picture. `None` if the model does not support this, or not

@@ -36,6 +36,8 @@ pub struct MethodEntry {
     pub single_file: Option<SingleFile>,
     /// Whether the method trains only on keyframes with depth.
     pub needs_depth: bool,
+    /// Whether models can be sent to clients that draw them themselves, see [`Method::queue_chunks`].
+    pub has_chunks: bool,
     /// Camera parameters that can be optimized with the scene.
     pub learnable: ParamSet,
     /// Export formats, the preferred one first.

@@ -2,7 +2,7 @@
 
 use crate::Hub;
 use crate::clock::ServerClock;
-use crate::hub::{Demand, LiveImages, RangeScans};
+use crate::hub::{Demand, LiveImages, ModelLists, RangeScans};
 use crate::keyframe_log::KeyframeLog;
 use crate::keyframe_points::pack_points;
 use crate::picture::pack_live_image;
@@ -47,6 +47,8 @@ pub(crate) struct LatestMessages {
     pub(crate) range_scans: BTreeMap<Arc<str>, Item>,
     /// Points of keyframes by number, if a client draws them; `None` for keyframes without points.
     pub(crate) keyframe_points: BTreeMap<u64, Option<Message>>,
+    /// Chunks of the models that clients draw.
+    pub(crate) model_chunks: ModelLists,
 }
 
 /// Camera and maximum size of a live image.
@@ -70,6 +72,7 @@ impl LatestMessages {
             && self.base_path.is_none()
             && self.range_scans.is_empty()
             && self.keyframe_points.is_empty()
+            && self.model_chunks.is_empty()
     }
 }
 
@@ -92,6 +95,7 @@ pub(crate) async fn broadcast(hub: Hub, clock: ServerClock, latest_messages_send
     let (mut scene, mut status, mut robot, mut keyframes, live_images) =
         (hub.scene(), hub.status(), hub.robot(), hub.keyframes(), hub.live_images());
     let (mut base_path, mut range_scans) = (hub.base_path(), hub.range_scans());
+    let mut model_chunks = hub.model_chunks();
     // A client may connect before the first check, and it has not received what was set earlier.
     scene.mark_changed();
     status.mark_changed();
@@ -190,6 +194,9 @@ pub(crate) async fn broadcast(hub: Hub, clock: ServerClock, latest_messages_send
             publish_item(&|latest_messages, number| {
                 latest_messages.robot = Some(Item { number, message: message.clone() });
             });
+        }
+        if let Some(lists) = take_if_changed(&mut model_chunks) {
+            publish_item(&|latest_messages, _| latest_messages.model_chunks = lists.clone());
         }
         if status_sent.is_due()
             && let Some(latest) = take_if_changed(&mut status).flatten()

@@ -1,6 +1,7 @@
 //! Decides which update a client receives next, according to its subscriptions.
 
 use crate::broadcast::{Item, LatestMessages};
+use crate::chunk_sender::{ChunkSender, NextChunk};
 use crate::keyframe_log::{Changes, ListPosition};
 use crate::subscriptions::Subscriptions;
 use axum::extract::ws::Message;
@@ -30,6 +31,7 @@ pub(crate) struct ClientUpdates {
     keyframe_points_at: Option<Instant>,
     /// Number of the subscription to points that these points belong to.
     n_point_subscriptions: u64,
+    model_chunks: ChunkSender,
 }
 
 /// Number of the last item of a kind, and when it was sent.
@@ -63,9 +65,14 @@ impl Timer {
     fn is_due(&mut self, last: Option<Instant>, period: Duration) -> bool {
         let due = last.and_then(|at| at.checked_add(period)).unwrap_or(self.now);
         if due > self.now {
-            self.earliest = Some(self.earliest.map_or(due, |earliest| earliest.min(due)));
+            self.wait_until(due);
         }
         due <= self.now
+    }
+
+    /// Records that an item is due at this time.
+    fn wait_until(&mut self, due: Instant) {
+        self.earliest = Some(self.earliest.map_or(due, |earliest| earliest.min(due)));
     }
 }
 
@@ -100,6 +107,9 @@ impl ClientUpdates {
                     self.was_image = is_image;
                     return Next::Long(message);
                 }
+            }
+            if let Some(message) = self.next_chunk(latest, subscriptions, &mut timer) {
+                return Next::Long(message);
             }
         }
         timer.earliest.map_or(Next::Wait, Next::WaitUntil)
@@ -220,6 +230,25 @@ impl ClientUpdates {
         self.keyframe_changes_at = log.is_up_to_date(position).then_some(timer.now);
         self.keyframe_changes = position;
         Some(Message::text(json))
+    }
+
+    /// A chunk of the model that the client draws, or the ids of removed chunks.
+    fn next_chunk(
+        &mut self,
+        latest: &LatestMessages,
+        subscriptions: &Subscriptions,
+        timer: &mut Timer,
+    ) -> Option<Message> {
+        let subscription = subscriptions.model_chunks.as_ref()?;
+        let list = latest.model_chunks.get(&subscription.method)?;
+        match self.model_chunks.next(list, subscription, timer.now) {
+            NextChunk::Send(message) => Some(message),
+            NextChunk::WaitUntil(due) => {
+                timer.wait_until(due);
+                None
+            }
+            NextChunk::Wait => None,
+        }
     }
 
     /// The points of the newest keyframe that the client has without points.

@@ -1,6 +1,7 @@
 //! Shared state of the training thread and the server. The training thread never waits for a client.
 
 use crate::base_path::BasePath;
+use crate::chunk_list::ChunkList;
 use crate::picture::packing;
 use crate::pose::row_major;
 use crate::protocol::{Control, ProjectionMessage};
@@ -19,7 +20,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Weak};
 use std::time::{Duration, Instant};
 use tokio::sync::{Notify, watch};
-use trainer::{Packing, Projection, RenderRequest, Rendered};
+use trainer::{ModelChunks, Packing, Projection, RenderRequest, Rendered};
 
 /// Handle shared by the training thread and a [`Server`](crate::Server). Clones refer to the same hub.
 #[derive(Clone, Debug, Default)]
@@ -32,6 +33,9 @@ pub(crate) type LiveImages = BTreeMap<Arc<str>, Arc<LiveImage>>;
 
 /// Latest scans by scanner name.
 pub(crate) type RangeScans = BTreeMap<Arc<str>, Arc<RangeScan>>;
+
+/// Chunks of models by method.
+pub(crate) type ModelLists = BTreeMap<Arc<str>, Arc<ChunkList>>;
 
 /// Keyframes by camera and stamp.
 type KeyframeSources = BTreeMap<(Arc<str>, i64), Weak<Keyframe>>;
@@ -75,6 +79,10 @@ struct Shared {
     live_images: watch::Sender<LiveImages>,
     /// Keyframes whose points clients can draw. The run owns them and may drop them at any time.
     keyframe_sources: Mutex<KeyframeSources>,
+    /// Chunks of the models to which clients subscribe.
+    model_chunks: watch::Sender<ModelLists>,
+    /// Pose of the models in the world of the clients; the identity if `None`.
+    world_from_model: Mutex<Option<Transform>>,
     robot: watch::Sender<Option<Arc<RobotDescription>>>,
     robot_state: watch::Sender<Option<Arc<RobotState>>>,
     base_path: watch::Sender<BasePath>,
@@ -151,6 +159,47 @@ impl Hub {
     /// Replaces the keyframe frustums. Call this when the keyframes have changed.
     pub fn set_keyframes(&self, keyframes: Vec<KeyframePose>) {
         self.shared.keyframes.send_replace(keyframes.into());
+    }
+
+    /// The minimum time between two calls of [`Self::set_model_chunks`] for a model; `None` if no client draws it.
+    pub fn chunk_period(&self, method: &str) -> Option<Duration> {
+        let demands = self.shared.demands.lock();
+        let subscriptions = demands.values().filter_map(|demand| demand.subscriptions.model_chunks.as_ref());
+        subscriptions.filter(|chunks| &*chunks.method == method).map(|chunks| chunks.period).min()
+    }
+
+    /// Whether clients have the chunks of this model, so that only changed chunks are needed.
+    pub fn has_model_chunks(&self, method: &str) -> bool {
+        self.shared.model_chunks.borrow().contains_key(method)
+    }
+
+    /// Sets the chunks of a model, or those that have changed. They are kept only while a client draws the model.
+    pub fn set_model_chunks(&self, method: &str, chunks: ModelChunks) {
+        if self.chunk_period(method).is_none() {
+            return;
+        }
+        self.shared.model_chunks.send_modify(|lists| {
+            let mut list = lists.get(method).map(|list| (**list).clone()).unwrap_or_default();
+            list.world_from_model = self.shared.world_from_model.lock().unwrap_or_default();
+            if list.apply(chunks) {
+                lists.insert(method.into(), Arc::new(list));
+            }
+        });
+    }
+
+    /// Sets the pose of models in the world of the clients, for chunks; by default, the two frames are the same.
+    pub fn set_world_from_model(&self, world_from_model: Transform) {
+        *self.shared.world_from_model.lock() = Some(world_from_model);
+    }
+
+    /// Frees the chunks of models that no client draws any longer.
+    fn drop_unused_chunks(&self) {
+        let unused = |method: &str| self.chunk_period(method).is_none();
+        self.shared.model_chunks.send_if_modified(|lists| {
+            let n_before = lists.len();
+            lists.retain(|method, _| !unused(method));
+            lists.len() < n_before
+        });
     }
 
     /// Sets the robot that clients draw.
@@ -258,11 +307,13 @@ impl Hub {
     pub(crate) fn leave(&self, client: u64) {
         self.queue().leave(client);
         self.shared.demands.lock().remove(&client);
+        self.drop_unused_chunks();
     }
 
     /// Sets what a client receives.
     pub(crate) fn set_demand(&self, client: u64, demand: Demand) {
         self.shared.demands.lock().insert(client, demand);
+        self.drop_unused_chunks();
     }
 
     /// What the connected clients receive.
@@ -312,6 +363,10 @@ impl Hub {
 
     pub(crate) fn range_scans(&self) -> watch::Receiver<RangeScans> {
         self.shared.range_scans.subscribe()
+    }
+
+    pub(crate) fn model_chunks(&self) -> watch::Receiver<ModelLists> {
+        self.shared.model_chunks.subscribe()
     }
 
     pub(crate) fn live_images(&self) -> watch::Receiver<LiveImages> {

@@ -17,6 +17,8 @@ mod admission;
 mod base_path;
 mod broadcast;
 mod certificate;
+mod chunk_list;
+mod chunk_sender;
 mod client_updates;
 mod clock;
 mod compact_depth;

@@ -54,7 +54,11 @@ fn check_subscription(subscriptions: &mut Subscriptions, message: SubscribeMessa
     }
     let images = subscriptions.images_of(&camera);
     let Subscriptions { status, keyframes, robot_state, keyframe_points, range_scans, base_path, .. } = *subscriptions;
-    let periods = [status, keyframes, robot_state, keyframe_points, range_scans, base_path, images.period];
+    let chunks = subscriptions.model_chunks.as_ref();
+    let chunk_period = chunks.map(|chunks| chunks.period);
+    let periods =
+        [status, keyframes, robot_state, keyframe_points, range_scans, base_path, images.period, chunk_period];
+    assert!(chunks.is_none_or(|chunks| chunks.method.len() <= 256 && chunks.max_bytes_per_sec >= 1e4));
     assert!(periods.into_iter().flatten().all(|period| period.as_secs_f64() >= 0.999 / MAX_RATE_HZ));
     for size_px in [[640, 480], [1, 4000], [4096, 1]] {
         let fitted = fitted(size_px, images.max_px);

@@ -77,6 +77,8 @@ pub(crate) enum Topic {
     RangeScans,
     /// The path of a moving base.
     BasePath,
+    /// Chunks of a model, for clients that draw it themselves.
+    ModelChunks,
 }
 
 /// Fields of `subscribe`.
@@ -91,6 +93,10 @@ pub(crate) struct SubscribeMessage {
     pub(crate) camera: Option<String>,
     /// Maximum size of images.
     pub(crate) size_px: Option<[u32; 2]>,
+    /// The model whose chunks are sent.
+    pub(crate) method: Option<String>,
+    /// Maximum rate of changed chunks.
+    pub(crate) max_bytes_per_sec: Option<f64>,
 }
 
 /// Fields of `control`.

@@ -7,6 +7,7 @@ use crate::protocol::{DepthFormat, ProjectionMessage};
 use crate::robot::{RobotMessage, RobotStateMessage};
 use crate::updates::{KeyframePose, LiveImage, SceneHint, Status};
 use serde::Serialize;
+use trainer::ChunkLayout;
 
 /// JSON text messages from the server.
 #[derive(Debug, Serialize)]
@@ -40,6 +41,8 @@ pub(crate) enum ServerMessage<'a> {
     RobotState(RobotStateMessage),
     /// Positions of a moving base so far.
     BasePath { points_m: Vec<[f64; 3]> },
+    /// Chunks of a model that no longer exist.
+    ModelChunksRemoved { method: &'a str, ids: Vec<u64> },
     /// Reason why a message was invalid or a picture failed.
     Error {
         id: Option<u64>,
@@ -115,6 +118,8 @@ pub(crate) enum BinaryHeader<'a> {
     KeyframePoints(PointsHeader),
     /// A scan of a range scanner.
     RangeScan(RangeScanHeader<'a>),
+    /// A chunk of a model.
+    ModelChunk(&'a ChunkHeader<'a>),
     /// A part of a binary message.
     Part(PartHeader),
 }
@@ -135,6 +140,19 @@ pub(crate) struct RangeScanHeader<'a> {
     pub(crate) origin_m: [f64; 3],
     pub(crate) n_points: usize,
     pub(crate) meters_per_count: f64,
+}
+
+/// Header of `model_chunk`.
+#[derive(Clone, Copy, Debug, Serialize)]
+pub(crate) struct ChunkHeader<'a> {
+    pub(crate) method: &'a str,
+    pub(crate) id: u64,
+    pub(crate) is_coarse: bool,
+    pub(crate) n_chunks: usize,
+    pub(crate) n_incomplete: usize,
+    pub(crate) world_from_model: [f64; 16],
+    #[serde(flatten)]
+    pub(crate) layout: ChunkLayout,
 }
 
 /// Header of `part`.

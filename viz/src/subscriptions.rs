@@ -15,6 +15,9 @@ const DEFAULT_IMAGE_PX: [u32; 2] = [640, u32::MAX];
 /// Minimum size of live images, pixels. Larger sizes are rounded down to multiples of it, so that clients of similar
 /// sizes share images.
 const MIN_IMAGE_PX: u32 = 16;
+/// Default and limits of the rate at which changed chunks are sent: 4.8 Mbit/s leaves room on ordinary wireless links.
+const DEFAULT_CHUNK_BYTES_PER_SEC: f64 = 6e5;
+const CHUNK_BYTES_PER_SEC: std::ops::RangeInclusive<f64> = 1e4..=1e9;
 /// Longest period. Slower subscriptions get one message a day.
 const MAX_PERIOD: Duration = Duration::from_secs(86_400);
 
@@ -37,6 +40,9 @@ pub(crate) struct Subscriptions {
     pub(crate) range_scans: Option<Duration>,
     /// The same for the path of the base.
     pub(crate) base_path: Option<Duration>,
+    /// Chunks of a model; `None` if not sent.
+    pub(crate) model_chunks: Option<ChunkSubscription>,
+    n_chunk_subscriptions: u64,
     /// Images of cameras without a subscription of their own.
     live_images: ImageSubscription,
     /// Images of single cameras.
@@ -52,6 +58,19 @@ pub(crate) struct ImageSubscription {
     pub(crate) max_px: [u32; 2],
 }
 
+/// Subscription to the chunks of a model.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct ChunkSubscription {
+    /// Counts the subscriptions of the client. Each of them begins with all chunks.
+    pub(crate) number: u64,
+    /// The model.
+    pub(crate) method: Arc<str>,
+    /// Minimum time between two versions of a chunk.
+    pub(crate) period: Duration,
+    /// Budget for chunks that the client already has in an older version.
+    pub(crate) max_bytes_per_sec: f64,
+}
+
 impl Default for Subscriptions {
     fn default() -> Self {
         Self {
@@ -63,6 +82,8 @@ impl Default for Subscriptions {
             n_point_subscriptions: 0,
             range_scans: None,
             base_path: None,
+            model_chunks: None,
+            n_chunk_subscriptions: 0,
             live_images: ImageSubscription { period: Some(Duration::from_millis(190)), max_px: DEFAULT_IMAGE_PX },
             cameras: BTreeMap::new(),
         }
@@ -72,12 +93,15 @@ impl Default for Subscriptions {
 impl Subscriptions {
     /// Applies a client's message.
     pub(crate) fn apply(&mut self, message: SubscribeMessage) -> Result<(), InvalidRequest> {
-        let SubscribeMessage { topic, rate_hz, camera, size_px } = message;
+        let SubscribeMessage { topic, rate_hz, camera, size_px, method, max_bytes_per_sec } = message;
         if !(0.0..=MAX_RATE_HZ).contains(&rate_hz) {
             return Err(InvalidRequest::Rate { got: rate_hz });
         }
         if topic != Topic::LiveImages && (camera.is_some() || size_px.is_some()) {
             return Err(InvalidRequest::NotImages);
+        }
+        if topic != Topic::ModelChunks && (method.is_some() || max_bytes_per_sec.is_some()) {
+            return Err(InvalidRequest::NotChunks);
         }
         if let Some(got) = size_px.filter(|size_px| size_px.iter().any(|side| *side < MIN_IMAGE_PX)) {
             return Err(InvalidRequest::ImageSize { got, min: MIN_IMAGE_PX });
@@ -97,6 +121,7 @@ impl Subscriptions {
             }
             Topic::RangeScans => self.range_scans = period,
             Topic::BasePath => self.base_path = period,
+            Topic::ModelChunks => self.model_chunks = self.chunk_subscription(period, method, max_bytes_per_sec)?,
             Topic::LiveImages => {
                 let rounded = |size_px: [u32; 2]| size_px.map(|side| side / MIN_IMAGE_PX * MIN_IMAGE_PX);
                 let images = ImageSubscription { period, max_px: size_px.map_or(DEFAULT_IMAGE_PX, rounded) };
@@ -107,6 +132,27 @@ impl Subscriptions {
             }
         }
         Ok(())
+    }
+
+    fn chunk_subscription(
+        &mut self,
+        period: Option<Duration>,
+        method: Option<String>,
+        max_bytes_per_sec: Option<f64>,
+    ) -> Result<Option<ChunkSubscription>, InvalidRequest> {
+        let Some(period) = period else { return Ok(None) };
+        let method = method.filter(|name| name.len() <= MAX_NAME_BYTES).ok_or(InvalidRequest::NoMethod)?;
+        let max_bytes_per_sec = max_bytes_per_sec.unwrap_or(DEFAULT_CHUNK_BYTES_PER_SEC);
+        if !CHUNK_BYTES_PER_SEC.contains(&max_bytes_per_sec) {
+            return Err(InvalidRequest::ByteRate { got: max_bytes_per_sec });
+        }
+        self.n_chunk_subscriptions += 1;
+        Ok(Some(ChunkSubscription {
+            number: self.n_chunk_subscriptions,
+            method: method.into(),
+            period,
+            max_bytes_per_sec,
+        }))
     }
 
     /// The subscription to the images of a camera.
@@ -184,6 +230,10 @@ mod tests {
             (json!({"topic": "status", "rate_hz": 1, "size_px": [9, 9]}), "live_images"),
             (json!({"topic": "live_images", "rate_hz": 1, "size_px": [9, 100]}), "16"),
             (json!({"topic": "live_images", "rate_hz": 1, "colour": true}), "colour"),
+            (json!({"topic": "model_chunks", "rate_hz": 1}), "method"),
+            (json!({"topic": "model_chunks", "rate_hz": 1, "method": "m".repeat(999)}), "method"),
+            (json!({"topic": "model_chunks", "rate_hz": 1, "method": "m", "max_bytes_per_sec": 1}), "10000"),
+            (json!({"topic": "status", "rate_hz": 1, "method": "splat"}), "model_chunks"),
         ] {
             let error = apply(&mut subscriptions, message.clone()).expect_err("invalid");
             assert!(error.contains(named), "{message}: {error}");

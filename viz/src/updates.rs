@@ -69,6 +69,8 @@ pub struct ModelStatus {
     pub primitives_label: String,
     /// GPU memory used by the model, bytes.
     pub bytes: u64,
+    /// Whether the model can be sent in chunks, so that clients can draw it themselves.
+    pub has_chunks: bool,
     /// Mean PSNR over the test keyframes, dB; `None` before the first evaluation.
     pub psnr: Option<f64>,
     /// `(seconds, psnr)` of every evaluation so far, in order.

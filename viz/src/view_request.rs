@@ -56,6 +56,12 @@ pub(crate) enum InvalidRequest {
     Rate { got: f64 },
     #[error("camera and size_px apply only to the topic live_images")]
     NotImages,
+    #[error("method and max_bytes_per_sec apply only to the topic model_chunks")]
+    NotChunks,
+    #[error("the topic model_chunks needs method, the name of the model")]
+    NoMethod,
+    #[error("max_bytes_per_sec is {got}, expected 10000 to 1000000000")]
+    ByteRate { got: f64 },
     #[error("size_px is {got:?}, each side must be at least {min}")]
     ImageSize { got: [u32; 2], min: u32 },
     #[error("at most {max} cameras can have a subscription of their own, with names of at most {max_bytes} bytes")]

@@ -170,6 +170,7 @@ fn publish_updates(hub: &Hub) {
             primitives: 84_512,
             primitives_label: "Splats".to_owned(),
             bytes: 61_210_112,
+            has_chunks: true,
             psnr: Some(26.76),
             psnr_history: (0..50).map(curve).collect(),
         },

@@ -16,6 +16,7 @@ use std::io::{Read, Write};
 use std::net::{SocketAddr, TcpListener, TcpStream};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
+use trainer::{ChunkData, ChunkLayout, ModelChunk, ModelChunks};
 use viz::{
     Control, Error, Hub, KeyframePose, LiveImage, LivePixels, ModelStatus, PendingRender, RangeScan, SceneHint, Server,
     ServerConfig, Status,
@@ -394,6 +395,12 @@ fn one_of_each() -> Vec<Value> {
     client.send_json(&render_message(1));
     draw_all(&hub, 1);
     messages.push(client.binary_of("picture").0);
+    client.send_json(&json!({"type": "subscribe", "topic": "model_chunks", "rate_hz": 1, "method": "tsdf"}));
+    client.settle();
+    hub.set_model_chunks("tsdf", ModelChunks { is_complete: true, chunks: both_chunks(), removed: Vec::new() });
+    messages.extend([(); 2].map(|()| client.binary_of("model_chunk").0));
+    hub.set_model_chunks("tsdf", ModelChunks { is_complete: true, ..ModelChunks::default() });
+    messages.push(client.text_of("model_chunks_removed"));
     client.send_raw(tungstenite::Message::text("{"));
     messages.push(client.text_of("error"));
     drop(server);
@@ -411,6 +418,25 @@ fn range_scan() -> RangeScan {
         }),
         map_from_odom: Transform::identity(),
     }
+}
+
+/// A chunk of each kind.
+fn both_chunks() -> Vec<ModelChunk> {
+    let mesh = ChunkLayout::Mesh { origin_m: [0.0; 3], meters_per_count: 0.1, n_vertices: 0, n_triangles: 0 };
+    let splats = ChunkLayout::Splats {
+        n_splats: 0,
+        min_m: [0.0; 3],
+        max_m: [1.0; 3],
+        log_scale_range: [-4.0, -2.0],
+        scale_factor: 1.0,
+        sh_degree: 0,
+        sh_ranges: [0.0; 2],
+    };
+    let chunk = |(id, layout)| {
+        let fine = ChunkData { layout, bytes: Vec::new() };
+        ModelChunk { id, change: 1.0, coarse: None, fine }
+    };
+    [(1, mesh), (2, splats)].map(chunk).into()
 }
 
 /// The part of the docs about a message from the server.

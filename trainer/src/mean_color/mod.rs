@@ -27,6 +27,7 @@ pub(crate) static ENTRY: MethodEntry = MethodEntry {
     files: &[COLOR_FILE],
     single_file: None,
     needs_depth: false,
+    has_chunks: false,
     learnable: ParamSet::empty(),
     exports: &[],
     default_options: default_options::<MeanColorOptions>,

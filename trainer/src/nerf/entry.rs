@@ -22,6 +22,7 @@ pub(crate) static ENTRY: MethodEntry = MethodEntry {
     files: &[FIELD_FILE],
     single_file: None,
     needs_depth: false,
+    has_chunks: false,
     learnable: ParamSet::IMAGE_POSES.union(ParamSet::IMAGE_GAINS),
     exports: &[], // No other program can read the format.
     default_options: default_options::<NerfOptions>,

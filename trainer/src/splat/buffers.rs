@@ -4,7 +4,7 @@ use super::arrays::SplatArrays;
 use super::kernels::DrawPipelines;
 use super::params::{Capacity, Model, TILE_PX, status};
 use crate::Error;
-use crate::gpu::{Buffer, Gpu, Passes};
+use crate::gpu::{Buffer, Gpu, Passes, PendingRead};
 use crate::sort::SortBuffers;
 
 /// Splats per block, consecutive in depth. This constant and the next two are those of shared/bins.wgsl.
@@ -167,36 +167,27 @@ impl SplatBuffers {
 
     /// Reads the parameters back.
     pub(crate) fn read(&self, gpu: &Gpu) -> Result<SplatArrays, Error> {
-        let n = self.n_splats as usize;
-        let stride = self.capacity as usize;
-        let means: Vec<[f32; 4]> = gpu.read(&self.means, n)?;
-        let rotations: Vec<[f32; 4]> = gpu.read(&self.rotations, n)?;
-        let shapes: Vec<[f32; 4]> = gpu.read(&self.shapes, n)?;
-        let dc: Vec<f32> = gpu.read(&self.sh_dc, 3 * stride)?;
-        let n_rest = n_sh_rest(self.sh_degree) as usize;
-        let rest: Vec<f32> = gpu.read(&self.sh_rest, n_rest * stride)?;
-        let n_coeffs = 1 + n_rest / 3;
-        let coeff = |ix: usize, function: usize| -> [f32; 3] {
-            std::array::from_fn(|channel| {
-                if function == 0 {
-                    dc[channel * stride + ix]
-                } else {
-                    rest[(3 * (function - 1) + channel) * stride + ix]
-                }
-            })
-        };
-        let sh = (0..n)
-            .flat_map(|ix| (0..n_coeffs).map(move |function| (ix, function)))
-            .map(|(ix, function)| coeff(ix, function))
-            .collect();
-        Ok(SplatArrays {
-            means: means.iter().map(|[x, y, z, _]| [*x, *y, *z]).collect(),
-            log_scales: shapes.iter().map(|[x, y, z, _]| [*x, *y, *z]).collect(),
-            rotations_wxyz: rotations,
-            opacity_logits: shapes.iter().map(|shape| shape[3]).collect(),
-            sh,
-            sh_degree: self.sh_degree,
-        })
+        if self.n_splats == 0 {
+            return Ok(SplatArrays { sh_degree: self.sh_degree, ..SplatArrays::default() });
+        }
+        self.begin_read(gpu, self.sh_degree).finish(gpu)
+    }
+
+    /// Begins to read the parameters of at least one splat, with color coefficients up to this degree.
+    pub(crate) fn begin_read(&self, gpu: &Gpu, max_sh_degree: u32) -> PendingSplats {
+        let (n, stride) = (self.n_splats as usize, self.capacity as usize);
+        let sh_degree = self.sh_degree.min(max_sh_degree);
+        let n_rest = n_sh_rest(sh_degree) as usize;
+        PendingSplats {
+            means: gpu.begin_read(&self.means, 4 * n),
+            rotations: gpu.begin_read(&self.rotations, 4 * n),
+            shapes: gpu.begin_read(&self.shapes, 4 * n),
+            dc: gpu.begin_read(&self.sh_dc, 3 * stride),
+            rest: (n_rest > 0).then(|| gpu.begin_read(&self.sh_rest, n_rest * stride)),
+            n,
+            stride,
+            sh_degree,
+        }
     }
 
     /// The parameters, with their binding names in the kernels.
@@ -229,6 +220,53 @@ impl SplatBuffers {
             (&self.sh_rest_moments, 1, 4),
             (&self.error_sums, 1, 4),
         ]
+    }
+}
+
+/// The parameters of splats, while they are being read back.
+#[derive(Debug)]
+pub(crate) struct PendingSplats {
+    means: PendingRead,
+    rotations: PendingRead,
+    shapes: PendingRead,
+    dc: PendingRead,
+    rest: Option<PendingRead>,
+    n: usize,
+    stride: usize,
+    sh_degree: u32,
+}
+
+impl PendingSplats {
+    /// Waits for the parameters.
+    pub(crate) fn finish(self, gpu: &Gpu) -> Result<SplatArrays, Error> {
+        let Self { n, stride, sh_degree, .. } = self;
+        let means: Vec<[f32; 4]> = self.means.finish(gpu)?;
+        let rotations_wxyz: Vec<[f32; 4]> = self.rotations.finish(gpu)?;
+        let shapes: Vec<[f32; 4]> = self.shapes.finish(gpu)?;
+        let dc: Vec<f32> = self.dc.finish(gpu)?;
+        let rest: Vec<f32> = self.rest.map_or(Ok(Vec::new()), |rest| rest.finish(gpu))?;
+        let n_coeffs = (sh_degree as usize + 1).pow(2);
+        let coeff = |ix: usize, function: usize| -> [f32; 3] {
+            std::array::from_fn(|channel| {
+                if function == 0 {
+                    dc[channel * stride + ix]
+                } else {
+                    rest[(3 * (function - 1) + channel) * stride + ix]
+                }
+            })
+        };
+        let sh = (0..n)
+            .flat_map(|ix| (0..n_coeffs).map(move |function| (ix, function)))
+            .map(|(ix, function)| coeff(ix, function))
+            .collect();
+        Ok(SplatArrays {
+            means: means.iter().map(|[x, y, z, _]| [*x, *y, *z]).collect(),
+            log_scales: shapes.iter().map(|[x, y, z, _]| [*x, *y, *z]).collect(),
+            rotations_wxyz,
+            opacity_logits: shapes.iter().map(|shape| shape[3]).collect(),
+            sh,
+            sh_degree,
+        })
     }
 }
 

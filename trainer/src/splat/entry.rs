@@ -22,6 +22,7 @@ pub(crate) static ENTRY: MethodEntry = MethodEntry {
     files: &[IN_FOLDER],
     single_file: Some(SingleFile { description: "a file of splats", extensions: &["ply", "spz"] }),
     needs_depth: false,
+    has_chunks: true,
     learnable: ParamSet::EXTRINSICS
         .union(ParamSet::TIME_OFFSET)
         .union(ParamSet::LENS)

@@ -14,6 +14,7 @@ mod camera_params;
 mod change_against_twin;
 #[cfg(test)]
 mod checkpoint_tests;
+mod chunks;
 pub mod cloud;
 mod doubling;
 #[cfg(test)]

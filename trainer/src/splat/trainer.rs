@@ -21,6 +21,7 @@ mod view_set;
 use super::arrays::SplatArrays;
 use super::bounds::bounds;
 use super::buffers::SplatBuffers;
+use super::chunks::{Chunker, MAX_SH_DEGREE};
 use super::few_images::Scarcity;
 use super::file::IN_FOLDER;
 use super::growth_search::GrowthSearch;
@@ -35,6 +36,7 @@ use super::seed;
 use super::trials::{CountPolicy, SplatTrials, ValidationImage};
 use crate::checkpoint::PendingCheckpoint;
 use crate::gpu::{Gpu, PassTiming};
+use crate::model_chunks::PendingChunks;
 use crate::model_metadata::{METADATA_FILE, read_metadata};
 use crate::model_options::{MethodOptions, ModelOptions};
 use crate::packing::{Format, Output};
@@ -45,6 +47,7 @@ use kinematics::Stamp;
 use lazy_pipelines::LazyPipelines;
 use model::TrainedModel;
 use optimizer::Optimizer;
+use parking_lot::Mutex;
 use recorder::Recorder;
 use renderer::{DrawnView, Renderer};
 use seeding::Seeding;
@@ -72,6 +75,8 @@ pub struct SplatTrainer {
     saved_corrections: BTreeMap<String, CameraCorrection>,
     /// Background loaded with a saved model.
     saved_background_srgb: [f32; 3],
+    /// Encodes versions of the model for viewers, on another thread.
+    chunker: Arc<Mutex<Chunker>>,
 }
 
 impl SplatTrainer {
@@ -99,6 +104,7 @@ impl SplatTrainer {
             skipped: SkippedSteps::default(),
             saved_corrections: BTreeMap::new(),
             saved_background_srgb: [0.0; 3],
+            chunker: Arc::default(),
             recorder: Recorder::new(gpu),
             options,
         })
@@ -313,6 +319,20 @@ impl Method for SplatTrainer {
         }
         let camera = Camera::from_request(request, focal_px, principal_px);
         self.queue_view(&camera, request.background_srgb, packing)
+    }
+
+    fn queue_chunks(&mut self, only_changed: bool) -> Result<Option<PendingChunks>, Error> {
+        let splats = displayed(&self.growth_search, &self.trials, &self.model);
+        if splats.n_splats == 0 {
+            return Ok(None);
+        }
+        let gpu = Arc::clone(&self.recorder.gpu);
+        let pending = splats.begin_read(&gpu, splats.active_degree().min(MAX_SH_DEGREE));
+        let chunker = Arc::clone(&self.chunker);
+        Ok(Some(PendingChunks::new(move || {
+            let arrays = pending.finish(&gpu)?;
+            Ok(chunker.lock().chunks(&arrays, only_changed))
+        })))
     }
 
     fn set_watched(&mut self, watched: bool) {

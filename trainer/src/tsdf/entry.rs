@@ -23,6 +23,7 @@ pub(crate) static ENTRY: MethodEntry = MethodEntry {
     files: &[MESH_PLY, MESH_GLB, BLOCKS_FILE],
     single_file: None,
     needs_depth: true,
+    has_chunks: true,
     learnable: ParamSet::empty(),
     exports: &[
         Export {

@@ -1,18 +1,22 @@
 //! Triangle mesh of the surface of a field.
 
 mod cases;
+mod chunks;
 mod cluster;
 mod glb;
 mod mesher;
 mod ply;
 
 pub(super) use cases::CASES;
+pub(super) use chunks::ChangedChunks;
 pub use glb::write as write_glb;
 #[cfg(test)]
 pub(super) use mesher::unit_of;
 pub(super) use mesher::{BlockMesh, Mesher};
 pub use ply::write as write_ply;
 
+#[cfg(test)]
+mod chunk_tests;
 #[cfg(test)]
 mod tests;
 

@@ -21,6 +21,7 @@ use super::passes::Canvas;
 use crate::Bounds;
 use crate::checkpoint::PendingCheckpoint;
 use crate::gpu::{Gpu, PassTiming, Passes};
+use crate::model_chunks::PendingChunks;
 use crate::model_options::ModelOptions;
 use crate::packing::{Format, Reader};
 use crate::{CorrectedKeyframe, Error, Method, Packing, Picture, Progress, Recalibrate, RenderRequest, Rendered};
@@ -346,6 +347,13 @@ impl Method for TsdfModel {
         Rendered::of(request, Format::Packed(packing), |camera, output| {
             self.draw_view(camera, request.background_srgb, output)
         })
+    }
+
+    fn queue_chunks(&mut self, only_changed: bool) -> Result<Option<PendingChunks>, Error> {
+        self.update_mesh()?;
+        let Some(voxel_grid) = self.voxel_grid().cloned() else { return Ok(None) };
+        let chunks = self.meshing.take_chunks(only_changed);
+        Ok(Some(PendingChunks::new(move || Ok(chunks.encode(&voxel_grid)))))
     }
 
     fn set_watched(&mut self, watched: bool) {

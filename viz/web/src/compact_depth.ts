@@ -1,5 +1,7 @@
 // Decodes the depth format `compact_half`; the encoder is viz/src/compact_depth.rs.
 
+import { inflated } from "./zlib";
+
 /** Symbol of a pixel whose count follows after the symbols. */
 const ESCAPE = 255;
 /** The server renders at most 4096 x 4096 pixels. */
@@ -44,26 +46,4 @@ export async function decodeCompactDepth(
   const depth = new Float32Array(n);
   for (let ix = 0; ix < n; ix++) depth[ix] = meters[codes[ix]!]!;
   return depth;
-}
-
-/** Decompresses a zlib stream. Stops with an error above a maximum length. */
-async function inflated(zlib: Uint8Array<ArrayBuffer>, maxBytes: number): Promise<Uint8Array<ArrayBuffer>> {
-  const chunks: Uint8Array<ArrayBuffer>[] = [];
-  let nBytes = 0;
-  const reader = new Blob([zlib]).stream().pipeThrough(new DecompressionStream("deflate")).getReader();
-  for (let next = await reader.read(); !next.done; next = await reader.read()) {
-    chunks.push(next.value);
-    nBytes += next.value.length;
-    if (nBytes > maxBytes) {
-      void reader.cancel();
-      throw new Error(`a depth image is longer than ${maxBytes} bytes`);
-    }
-  }
-  const bytes = new Uint8Array(nBytes);
-  let offset = 0;
-  for (const chunk of chunks) {
-    bytes.set(chunk, offset);
-    offset += chunk.length;
-  }
-  return bytes;
 }

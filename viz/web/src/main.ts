@@ -12,7 +12,7 @@ import { LiveImages } from "./live_images";
 import { ModelSwitch } from "./model_switch";
 import { BACKGROUND, OrbitView } from "./orbit_view";
 import { panels } from "./panels";
-import type { BinaryHeader, LiveImageHeader, PictureHeader, Status, TextMessage } from "./protocol";
+import type { BinaryHeader, LiveImageHeader, ModelStatus, PictureHeader, Status, TextMessage } from "./protocol";
 import { Readouts } from "./readouts";
 import { RenderScheduler } from "./render_scheduler";
 import { RobotAge } from "./robot_age";
@@ -48,6 +48,7 @@ const connection = new Connection(`${location.protocol === "https:" ? "wss" : "w
       scheduler.restart();
       view.points.clear();
       view.scans.clear();
+      view.local.clear();
       subscriptions.restart();
       element("toggle-points").hidden = !connection.supports("keyframe_points");
     }
@@ -66,6 +67,7 @@ const models = new ModelSwitch(() => {
   scheduler.restart();
   if (latestStatus) showStatus(latestStatus);
 });
+let isDrawnLocally = false;
 const scheduler = new RenderScheduler(connection, () => view.view(), () => stages, BACKGROUND, () => models.method);
 
 const settings = new ViewSettings(view, scheduler);
@@ -111,6 +113,9 @@ function receiveText(message: TextMessage): void {
       view.scans.setPath(message.points_m);
       view.changed();
       break;
+    case "model_chunks_removed":
+      view.local.removed(message);
+      break;
     case "error":
       scheduler.failed(message.id);
       element("notice").textContent = message.message;
@@ -128,6 +133,23 @@ function showStatus(status: Status): void {
   readouts.show(status, model);
   if (model.step !== latestStep) scheduler.modelChanged();
   latestStep = model.step;
+  updateLocalModel(model);
+}
+
+/** Chooses whether the page or the server draws the model. */
+function updateLocalModel(model: ModelStatus): void {
+  const isPossible = connection.supports("model_chunks") && model.has_chunks === true;
+  element("toggle-local").hidden = !isPossible;
+  const method = isPossible && isDrawnLocally ? model.method : null;
+  view.local.method = method;
+  subscriptions.localModel = method;
+  scheduler.drawsLocally = method !== null;
+}
+
+function showLocalProgress(): void {
+  const { nChunks, nIncomplete } = view.local.progress;
+  element("picture-text").textContent =
+    nIncomplete > 0 ? `drawn here: ${nChunks - nIncomplete} of ${nChunks} parts` : `drawn here: ${nChunks} parts`;
 }
 
 function receiveBinary(header: BinaryHeader, payload: Uint8Array<ArrayBuffer>): void {
@@ -137,6 +159,9 @@ function receiveBinary(header: BinaryHeader, payload: Uint8Array<ArrayBuffer>): 
     view.scans.show(header, payload);
     element("toggle-scans").hidden = false;
     view.changed();
+  } else if (header.type === "model_chunk") {
+    view.local.receive(header, payload);
+    showLocalProgress();
   } else if (header.type === "keyframe_points") {
     view.points.add(header, payload);
     view.changed();
@@ -162,6 +187,7 @@ async function showPicture(header: PictureHeader, payload: Uint8Array<ArrayBuffe
   }
   view.changed();
   element("notice").textContent = "";
+  if (!header.color) return;
   const [width, height] = header.size_px;
   const percent = Math.round(100 * header.scale);
   element("picture-text").textContent = `${width} × ${height} (${percent} %) in ${millis.toFixed(0)} ms`;
@@ -203,7 +229,11 @@ action("look-live", "c", () => {
   if (liveCamera?.world_from_camera) view.lookFrom(liveCamera.world_from_camera);
 });
 element("look-live", HTMLButtonElement).disabled = true;
-toggle("toggle-model", "m", (isOn) => (view.picture.enabled = isOn));
+toggle("toggle-model", "m", (isOn) => (view.showsModel = isOn));
+toggle("toggle-local", "j", (isOn) => {
+  isDrawnLocally = isOn;
+  if (latestStatus) showStatus(latestStatus);
+});
 toggle("toggle-grid", "g", (isOn) => (view.overlays.showsGround = isOn));
 toggle("toggle-keyframes", "k", (isOn) => (view.overlays.showsKeyframes = isOn));
 toggle("toggle-crop", "x", (isOn) => (view.crop.enabled = isOn));

@@ -62,11 +62,26 @@ export class Occlusion {
   };
   private hasPicture = false;
   private isOn = true;
+  private isByDepthBuffer = false;
 
   /** Whether anything is hidden. */
   set enabled(enabled: boolean) {
     this.isOn = enabled;
-    this.shared.occlusionIsOn.value = enabled && this.hasPicture;
+    this.update();
+  }
+
+  get enabled(): boolean {
+    return this.isOn;
+  }
+
+  /** Sets whether the depth buffer contains the model, so that the picture is not needed. */
+  set usesDepthBuffer(usesDepthBuffer: boolean) {
+    this.isByDepthBuffer = usesDepthBuffer;
+    this.update();
+  }
+
+  private update(): void {
+    this.shared.occlusionIsOn.value = this.isOn && this.hasPicture && !this.isByDepthBuffer;
   }
 
   /** Adopts the depth of a picture; `depth` stays the property of the caller. */
@@ -83,7 +98,7 @@ export class Occlusion {
     this.shared.occlusionFocalPx.value.fromArray(focalPx);
     this.shared.occlusionPrincipalPx.value.fromArray(principalPx);
     this.hasPicture = true;
-    this.enabled = this.isOn;
+    this.update();
   }
 
   /** Makes a material of three.js hide its occluded fragments. */

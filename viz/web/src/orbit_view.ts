@@ -5,6 +5,7 @@ import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
 import { pinholeOfThreeCamera, poseOfThreeCamera, worldFromCamera } from "./convention";
 import type { PathView } from "./camera_path";
 import { CropBox } from "./crop_box";
+import { LocalModel } from "./local_model";
 import { MeasureTool } from "./measure";
 import { Occlusion } from "./occlusion";
 import { Overlays } from "./overlays";
@@ -27,6 +28,7 @@ export class OrbitView {
   readonly points = new PointsLayer(this.occlusion);
   readonly scans = new ScanLayer(this.occlusion);
   readonly robot = new RobotLayer(this.occlusion, () => this.changed());
+  readonly local = new LocalModel(() => this.changed());
   private readonly camera = new THREE.PerspectiveCamera(VERTICAL_FOV_DEGREES, 1, 0.01, 200);
   /** The picture. It is drawn first; the other objects compare their depth with the picture's in their shaders. */
   private readonly background = new THREE.Scene();
@@ -43,6 +45,7 @@ export class OrbitView {
   private scene: Scene | null = null;
   private hasUserMoved = false;
   private isStale = true;
+  private isModelShown = true;
 
   constructor(private readonly canvas: HTMLCanvasElement, private readonly onMove: () => void) {
     this.renderer = new THREE.WebGLRenderer({ canvas, antialias: true });
@@ -66,7 +69,8 @@ export class OrbitView {
     this.world.add(this.crop.root, this.measure.root);
     this.controls.addEventListener("start", () => (this.hasUserMoved = true));
     this.renderer.autoClear = false;
-    this.background.add(this.picture.mesh);
+    this.background.add(this.picture.mesh, this.local.root);
+    this.renderer.localClippingEnabled = true;
     const light = new THREE.DirectionalLight(0xffffff, 1.6);
     light.position.set(-0.4, 0.7, 1); // Over the viewer's left shoulder.
     this.camera.add(light);
@@ -229,6 +233,12 @@ export class OrbitView {
     return 0.9 * this.camera.far;
   }
 
+  /** Whether the model is drawn. */
+  set showsModel(shown: boolean) {
+    this.isModelShown = shown;
+    this.changed();
+  }
+
   /** Marks the view as changed. */
   changed(): void {
     this.isStale = true;
@@ -238,12 +248,21 @@ export class OrbitView {
   draw(): void {
     if (!this.isStale) return;
     this.isStale = false;
-    this.picture.setView(worldFromCamera(poseOfThreeCamera(this.camera)));
+    const view = this.view();
+    this.picture.setView(worldFromCamera(view.world_from_camera));
+    // The server's picture stays until the first chunks have arrived.
+    const isLocal = this.local.method !== null && this.local.hasChunks;
+    this.picture.enabled = this.isModelShown && !isLocal;
+    this.local.root.visible = this.isModelShown && isLocal;
+    this.local.crop = view.crop;
+    this.local.setView(view, [this.canvas.width, this.canvas.height]);
+    const hasDepthBuffer = isLocal && this.local.hasDepth;
+    this.occlusion.usesDepthBuffer = hasDepthBuffer;
     this.crop.update();
     this.measure.update();
     this.renderer.clear();
     this.renderer.render(this.background, this.camera);
-    this.renderer.clearDepth();
+    if (!hasDepthBuffer || !this.occlusion.enabled) this.renderer.clearDepth();
     this.renderer.render(this.world, this.camera);
   }
 

@@ -57,6 +57,8 @@ export class PictureLayer {
   /** The depth of the shown picture. */
   posedDepth: PosedDepth | null = null;
   private isEnabled = true;
+  /** Whether the newest picture has colors. */
+  private hasColor = false;
   private shown: { id: number; stage: number } | null = null;
 
   constructor(private readonly occlusion: Occlusion) {
@@ -85,7 +87,7 @@ export class PictureLayer {
   /** Whether the picture is drawn. */
   set enabled(enabled: boolean) {
     this.isEnabled = enabled;
-    this.mesh.visible = enabled && this.posedDepth !== null;
+    this.mesh.visible = enabled && this.hasColor;
   }
 
   /** Opacity of the picture, 0 to 1. */
@@ -100,22 +102,21 @@ export class PictureLayer {
     uniforms.isMoved!.value = worldFromView.elements.some((value, ix) => Math.abs(value - picture[ix]!) > 1e-4);
   }
 
-  /** Shows a picture unless a newer one is already shown. Returns whether it did. */
+  /** Shows a picture unless a newer one is already shown. Returns whether it did. A picture may consist of depth only. */
   async show(header: PictureHeader, payload: Uint8Array<ArrayBuffer>, emptyDepth: number): Promise<boolean> {
-    if (header.projection.kind !== "pinhole" || !header.color) return false;
-    const { offset, bytes } = header.color;
-    const jpeg = new Blob([payload.subarray(offset, offset + bytes)], { type: "image/jpeg" });
+    if (header.projection.kind !== "pinhole") return false;
     const [bitmap, depth] = await Promise.all([
-      createImageBitmap(jpeg, { colorSpaceConversion: "none" }),
+      header.color ? unpackColor(header.color, payload) : null,
       unpackDepth(header.depth, payload),
     ]);
     if (this.shown && (this.shown.id > header.id || (this.shown.id === header.id && this.shown.stage > header.stage))) {
-      bitmap.close();
+      bitmap?.close();
       return false;
     }
     this.shown = { id: header.id, stage: header.stage };
     const uniforms = this.mesh.material.uniforms as Record<string, THREE.IUniform>;
-    replaceTexture(uniforms.colorMap!, colorTexture(bitmap));
+    this.hasColor = bitmap !== null;
+    if (bitmap) replaceTexture(uniforms.colorMap!, colorTexture(bitmap));
     replaceTexture(uniforms.depthMap!, depth);
     const worldFromPicture = worldFromCamera(header.world_from_camera);
     uniforms.worldFromPicture!.value = worldFromPicture;
@@ -134,7 +135,7 @@ export class PictureLayer {
       depth: data,
       depthSizePx: [width, height],
     };
-    this.mesh.visible = this.isEnabled;
+    this.enabled = this.isEnabled;
     return true;
   }
 
@@ -149,6 +150,14 @@ function gridGeometry(): THREE.BufferGeometry {
   const geometry = new THREE.PlaneGeometry(1, 1, N_COLUMNS, N_ROWS);
   geometry.translate(0.5, 0.5, 0);
   return geometry;
+}
+
+function unpackColor(
+  { offset, bytes }: { offset: number; bytes: number },
+  payload: Uint8Array<ArrayBuffer>,
+): Promise<ImageBitmap> {
+  const jpeg = new Blob([payload.subarray(offset, offset + bytes)], { type: "image/jpeg" });
+  return createImageBitmap(jpeg, { colorSpaceConversion: "none" });
 }
 
 function colorTexture(bitmap: ImageBitmap): THREE.Texture {

@@ -17,6 +17,7 @@ export const CAPABILITIES = [
   "range_scans",
   "base_path",
   "control",
+  "model_chunks",
 ] as const;
 export type Capability = (typeof CAPABILITIES)[number];
 
@@ -59,6 +60,8 @@ export interface ModelStatus {
   primitives: number;
   primitives_label: string;
   bytes: number;
+  /** Whether the page can draw the model itself; missing on older servers. */
+  has_chunks: boolean;
   psnr: number | null;
   psnr_history: [number, number][];
 }
@@ -247,6 +250,49 @@ export interface KeyframePointsHeader {
   meters_per_count: number;
 }
 
+interface ChunkHeader {
+  type: "model_chunk";
+  /** The model. */
+  method: string;
+  id: number;
+  /** Whether the chunk is only an approximation. */
+  is_coarse: boolean;
+  /** Number of chunks of the model, and of those that are missing or coarse after this message. */
+  n_chunks: number;
+  n_incomplete: number;
+  world_from_model: number[];
+}
+
+/** A part of a mesh. */
+export interface MeshChunkHeader extends ChunkHeader {
+  kind: "mesh";
+  origin_m: [number, number, number];
+  meters_per_count: number;
+  n_vertices: number;
+  n_triangles: number;
+}
+
+/** Gaussian splats in a box. */
+export interface SplatChunkHeader extends ChunkHeader {
+  kind: "splats";
+  n_splats: number;
+  min_m: [number, number, number];
+  max_m: [number, number, number];
+  log_scale_range: [number, number];
+  scale_factor: number;
+  sh_degree: number;
+  sh_ranges: [number, number];
+}
+
+export type ModelChunkHeader = MeshChunkHeader | SplatChunkHeader;
+
+/** Chunks that no longer exist. */
+export interface ModelChunksRemoved {
+  type: "model_chunks_removed";
+  method: string;
+  ids: number[];
+}
+
 /** A part of a binary message that is `bytes` long. */
 export interface PartHeader {
   type: "part";
@@ -265,6 +311,7 @@ export type TextMessage =
   | Robot
   | RobotState
   | BasePath
+  | ModelChunksRemoved
   | ErrorMessage
   | Heartbeat
   | Pong
@@ -279,7 +326,12 @@ export interface RangeScanHeader {
   meters_per_count: number;
 }
 
-export type BinaryHeader = PictureHeader | LiveImageHeader | KeyframePointsHeader | RangeScanHeader;
+export type BinaryHeader =
+  | PictureHeader
+  | LiveImageHeader
+  | KeyframePointsHeader
+  | RangeScanHeader
+  | ModelChunkHeader;
 
 export interface HelloMessage {
   type: "hello";
@@ -289,10 +341,19 @@ export interface HelloMessage {
 
 export interface SubscribeMessage {
   type: "subscribe";
-  topic: "status" | "keyframes" | "live_images" | "robot_state" | "keyframe_points" | "range_scans" | "base_path";
+  topic:
+    | "status"
+    | "keyframes"
+    | "live_images"
+    | "robot_state"
+    | "keyframe_points"
+    | "range_scans"
+    | "base_path"
+    | "model_chunks";
   rate_hz: number;
   camera?: string;
   size_px?: [number, number];
+  method?: string;
 }
 
 export interface ControlMessage {

@@ -21,6 +21,8 @@ const REST_MILLIS = 180;
 const REFRESH_MILLIS = 700;
 /** Maximum fraction of the time spent on refreshes. */
 const REFRESH_SHARE = 0.25;
+/** The same if the page draws the model itself and needs only the depth. */
+const LOCAL_REFRESH_MILLIS = 3000;
 /** While moving, pictures that take longer than this are requested smaller, and pictures that take less than a third of it larger. */
 const MOVING_MILLIS = 110;
 const MOVING_SCALES = [0.1, 0.15, 0.25, 0.35, 0.5, 0.7, 1];
@@ -41,6 +43,8 @@ export class RenderScheduler {
   private hasUpdate = false;
   /** Whether every change of the model is requested as soon as the previous picture has arrived. */
   isContinuous = false;
+  /** Whether the page draws the model itself. Then, only the depth of the resting view is requested. */
+  private isLocal = false;
 
   constructor(
     private readonly connection: Connection,
@@ -56,6 +60,13 @@ export class RenderScheduler {
     // Does not wait for a full picture of the old view: the next request replaces it.
     if (this.isResting) this.isWaiting = false;
     this.isResting = false;
+  }
+
+  /** Sets whether the page draws the model itself. */
+  set drawsLocally(isLocal: boolean) {
+    if (isLocal === this.isLocal) return;
+    this.isLocal = isLocal;
+    this.restart();
   }
 
   /** Called when the model has changed. */
@@ -96,13 +107,14 @@ export class RenderScheduler {
     if (now - this.requestedAt > timeout) this.isWaiting = false;
     if (!this.isResting && now - this.movedAt > REST_MILLIS) {
       this.isResting = true;
-      const finer = this.stages().filter((scale) => scale > this.movingScale);
+      const finer = (this.isLocal ? [1] : this.stages()).filter((scale) => scale > this.movingScale);
       this.movingScale = 0;
       this.request(finer.length > 0 ? finer : [1]); // Replaces any pending request.
-    } else if (!this.isResting && !this.isWaiting) {
+    } else if (!this.isResting && !this.isWaiting && !this.isLocal) {
       this.request([MOVING_SCALES[this.movingIx]!]);
     } else if (this.isResting && !this.isWaiting && this.hasUpdate) {
-      const pause = this.isContinuous ? 0 : Math.max(REFRESH_MILLIS, this.lastMillis * (1 / REFRESH_SHARE - 1));
+      const period = this.isLocal ? LOCAL_REFRESH_MILLIS : REFRESH_MILLIS;
+      const pause = this.isContinuous ? 0 : Math.max(period, this.lastMillis * (1 / REFRESH_SHARE - 1));
       if (now - this.finishedAt > pause) this.request([1]);
     }
   }
@@ -118,7 +130,7 @@ export class RenderScheduler {
       method: this.method(), // Omitted from the message if undefined.
       ...this.view(),
       stages,
-      outputs: ["color", "depth"],
+      outputs: this.isLocal ? ["depth"] : ["color", "depth"],
       depth_format: this.connection.supports("compact_depth") ? "compact_half" : undefined,
       background_srgb: this.background,
     };

@@ -14,6 +14,8 @@ const POINTS_HZ = 20;
 /** Scans are sent this often, 36 kB each. */
 const SCANS_HZ = 2;
 const BASE_PATH_HZ = 1;
+/** Versions of the model per second, if the page draws it. */
+const CHUNKS_HZ = 1;
 /** Rate of the status, which the title bar needs, while the page is hidden. */
 const HIDDEN_STATUS_HZ = 0.5;
 /** Limits of the height of camera images, in CSS pixels: see `.live canvas` in app.css. */
@@ -33,6 +35,7 @@ export class Subscriptions {
   private showsPoints = false;
   private showsScans = true;
   private showsLargeImages = false;
+  private drawnMethod: string | null = null;
 
   private showsImages = true;
 
@@ -77,6 +80,12 @@ export class Subscriptions {
     this.update();
   }
 
+  /** The model that the page draws; null if the server draws it. */
+  set localModel(method: string | null) {
+    this.drawnMethod = method;
+    this.update();
+  }
+
   /** Sends the subscriptions that have changed. */
   update(): void {
     if (!this.connection.isOpen || !this.connection.supports("subscribe")) return;
@@ -110,6 +119,12 @@ export class Subscriptions {
     for (const [topic, rate_hz] of layers) {
       if (this.connection.supports(topic)) messages.push({ type: "subscribe", topic, rate_hz });
     }
+    if (this.connection.supports("model_chunks")) {
+      const chunks = { type: "subscribe", topic: "model_chunks" } as const;
+      messages.push(
+        this.drawnMethod ? { ...chunks, rate_hz: CHUNKS_HZ, method: this.drawnMethod } : { ...chunks, rate_hz: 0 },
+      );
+    }
     return messages;
   }
 
@@ -130,7 +145,7 @@ export class Subscriptions {
       messages.push({ type: "subscribe", topic: "live_images", camera, rate_hz: 0 });
     }
     if (this.connection.supports("robot")) messages.push({ type: "subscribe", topic: "robot_state", rate_hz: 0 });
-    for (const topic of ["keyframe_points", "range_scans", "base_path"] as const) {
+    for (const topic of ["keyframe_points", "range_scans", "base_path", "model_chunks"] as const) {
       if (this.connection.supports(topic)) messages.push({ type: "subscribe", topic, rate_hz: 0 });
     }
     return messages;

@@ -6,7 +6,8 @@ use crate::tsdf::block::{BLOCK_EDGE, GridCoord};
 use crate::tsdf::chosen_grid::VoxelGrid;
 use crate::tsdf::params::MeshVertex;
 use nalgebra::Vector3;
-use std::collections::{BTreeMap, HashMap};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::sync::Arc;
 
 /// The triangles of the cubes whose lowest corner is in one block.
 #[derive(Debug)]
@@ -18,19 +19,34 @@ pub(in crate::tsdf) struct BlockMesh {
 /// The most recent triangles of each block.
 #[derive(Debug, Default)]
 pub(in crate::tsdf) struct Mesher {
-    meshes: BTreeMap<GridCoord, BlockMesh>,
+    meshes: BTreeMap<GridCoord, Arc<BlockMesh>>,
+    /// Blocks replaced since the last [`Self::take_changed`]; `None` before the first.
+    changed: Option<BTreeSet<GridCoord>>,
 }
 
 impl Mesher {
     /// Replaces the triangles of these blocks.
     pub(in crate::tsdf) fn replace(&mut self, made: impl IntoIterator<Item = (GridCoord, BlockMesh)>) {
         for (block_coord, mesh) in made {
+            if let Some(changed) = &mut self.changed {
+                changed.insert(block_coord);
+            }
             if mesh.triangles.is_empty() {
                 self.meshes.remove(&block_coord);
             } else {
-                self.meshes.insert(block_coord, mesh);
+                self.meshes.insert(block_coord, Arc::new(mesh));
             }
         }
+    }
+
+    /// The triangles of all blocks that have some.
+    pub(in crate::tsdf) fn blocks(&self) -> &BTreeMap<GridCoord, Arc<BlockMesh>> {
+        &self.meshes
+    }
+
+    /// The blocks replaced since the last call; `None` in the first call, for all blocks.
+    pub(in crate::tsdf) fn take_changed(&mut self) -> Option<BTreeSet<GridCoord>> {
+        self.changed.replace(BTreeSet::new())
     }
 
     /// All triangles, in the order of their blocks; vertices shared by blocks are merged.
@@ -58,7 +74,7 @@ impl Mesher {
 }
 
 /// Key of an edge that may belong to several blocks: its first voxel in the field, and its axis.
-fn shared_key(block: GridCoord, edge: u32) -> Option<(GridCoord, u32)> {
+pub(super) fn shared_key(block: GridCoord, edge: u32) -> Option<(GridCoord, u32)> {
     let local = [edge / 3 % 9, edge / 27 % 9, edge / 243].map(u32::cast_signed);
     let is_shared = local.iter().any(|along| matches!(*along, 0 | BLOCK_EDGE));
     is_shared.then(|| (std::array::from_fn(|axis| BLOCK_EDGE * block[axis] + local[axis]), edge % 3))

@@ -8,7 +8,7 @@ use crate::tsdf::buffers::FieldBuffers;
 use crate::tsdf::capacity::Capacity;
 use crate::tsdf::chosen_grid::VoxelGrid;
 use crate::tsdf::kernels::Pipelines;
-use crate::tsdf::mesh::{BlockMesh, Mesh, Mesher};
+use crate::tsdf::mesh::{BlockMesh, ChangedChunks, Mesh, Mesher};
 use crate::tsdf::mesh_buffers::{MeshBuffers, MeshCapacity};
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -28,6 +28,11 @@ impl Meshing {
     /// The surface at the last update, in world.
     pub(super) fn mesh(&self, voxel_grid: &VoxelGrid) -> Mesh {
         self.mesher.mesh(voxel_grid)
+    }
+
+    /// Takes the chunks that have changed since the last call, or all of them.
+    pub(super) fn take_chunks(&mut self, only_changed: bool) -> ChangedChunks {
+        ChangedChunks::take(&mut self.mesher, only_changed)
     }
 
     /// Meshes the blocks that changed since the last call; returns their number. No submit may be in flight.

@@ -1,0 +1,135 @@
+//! Splats in spatial chunks, for viewers that draw them.
+//!
+//! A chunk is a cell of an octree. Splats have no stable identity in training, because growing reorders them, but cells
+//! have. Within a chunk, the most visible splats come first, and the first few of them, enlarged, approximate the chunk.
+
+mod cells;
+mod codec;
+
+use self::cells::{Cell, leaves, location_codes};
+use self::codec::{encode, opacity};
+use crate::model_chunks::{ChunkData, ModelChunk, ModelChunks};
+use crate::splat::arrays::SplatArrays;
+use rayon::prelude::*;
+use std::collections::BTreeMap;
+use std::hash::{DefaultHasher, Hasher};
+
+pub(super) use self::codec::MAX_SH_DEGREE;
+
+/// The coarse form of a chunk has one of this many splats.
+const COARSE_STRIDE: usize = 8;
+/// The maximum factor by which coarse splats are enlarged.
+const MAX_SCALE_FACTOR: f64 = 2.0;
+/// Changes are measured in `N_PARTS` parts of a cell.
+const N_PARTS: usize = 64;
+/// A change that leaves the sums of all parts as they are counts as this fraction of the sums.
+const MIN_CHANGE_FRAC: f64 = 1e-3;
+/// Splats that are more transparent are not drawn, see shared/projection.wgsl.
+const MIN_ALPHA: f64 = 1.0 / 255.0;
+
+/// Sums over the splats in each part of a cell: visible area, and the same times red, green and blue.
+type Sums = [[f64; 4]; N_PARTS];
+
+/// Divides the splats of successive versions of a model into chunks.
+#[derive(Debug, Default)]
+pub(super) struct Chunker {
+    /// The chunks of the last version.
+    last: BTreeMap<Cell, Content>,
+}
+
+/// What a chunk contained.
+#[derive(Debug)]
+struct Content {
+    hash: u64,
+    sums: Box<Sums>,
+}
+
+impl Chunker {
+    /// The chunks of these splats, or those that differ from the last call.
+    pub(super) fn chunks(&mut self, splats: &SplatArrays, only_changed: bool) -> ModelChunks {
+        if !only_changed {
+            self.last.clear();
+        }
+        let is_complete = self.last.is_empty();
+        let visible = visible_splats(splats);
+        let sorted = location_codes(&splats.means, &visible);
+        let cells = leaves(&sorted, &self.last);
+        let made: Vec<(Cell, Content, ModelChunk)> = cells
+            .into_par_iter()
+            .map(|(cell, range)| {
+                let sums = sums(splats, cell, &sorted[range.clone()]);
+                let mut members: Vec<u32> = sorted[range].iter().map(|(_, splat_ix)| *splat_ix).collect();
+                members.sort_by(|a, b| area(splats, *b).total_cmp(&area(splats, *a)));
+                let fine = encode(splats, &members, 1.0, splats.sh_degree);
+                let mut hasher = DefaultHasher::new();
+                hasher.write(&fine.bytes);
+                let content = Content { hash: hasher.finish(), sums };
+                let change = change(self.last.get(&cell), &content);
+                (cell, content, ModelChunk { id: cell.id(), change, coarse: coarse(splats, &members), fine })
+            })
+            .collect();
+        let mut last = std::mem::take(&mut self.last);
+        let mut chunks = Vec::new();
+        for (cell, content, chunk) in made {
+            let is_unchanged = last.remove(&cell).is_some_and(|before| before.hash == content.hash);
+            self.last.insert(cell, content);
+            if !is_unchanged {
+                chunks.push(chunk);
+            }
+        }
+        ModelChunks { is_complete, chunks, removed: last.into_keys().map(Cell::id).collect() }
+    }
+}
+
+/// Indices of the splats that are drawn. Splats with values that are not finite are not.
+fn visible_splats(splats: &SplatArrays) -> Vec<u32> {
+    let is_finite = |ix: usize| {
+        let shape = splats.means[ix].iter().chain(&splats.log_scales[ix]).chain(&splats.rotations_wxyz[ix]);
+        shape.chain(&splats.sh[ix * splats.n_coefficients()]).all(|value| value.is_finite())
+    };
+    let is_visible = |ix: &u32| opacity(splats, *ix) > MIN_ALPHA && is_finite(*ix as usize);
+    (0..u32::try_from(splats.n_splats()).unwrap_or(u32::MAX)).filter(is_visible).collect()
+}
+
+/// Opacity times the largest cross section of a splat, square meters up to a constant factor.
+fn area(splats: &SplatArrays, splat_ix: u32) -> f64 {
+    let log_scale = splats.log_scales[splat_ix as usize].map(f64::from);
+    let smallest = log_scale.into_iter().fold(f64::INFINITY, f64::min);
+    opacity(splats, splat_ix) * (log_scale.iter().sum::<f64>() - smallest).exp()
+}
+
+/// The first splats of a chunk, enlarged so that they cover its area.
+fn coarse(splats: &SplatArrays, members: &[u32]) -> Option<ChunkData> {
+    let n = members.len().div_ceil(COARSE_STRIDE);
+    let total = |members: &[u32]| members.iter().map(|ix| area(splats, *ix)).sum::<f64>();
+    let ratio = total(members) / total(&members[..n]);
+    let scale_factor = ratio.sqrt().clamp(1.0, MAX_SCALE_FACTOR);
+    (n < members.len()).then(|| encode(splats, &members[..n], scale_factor, 0))
+}
+
+/// Sums over the parts of a cell.
+fn sums(splats: &SplatArrays, cell: Cell, members: &[(u64, u32)]) -> Box<Sums> {
+    let mut sums: Box<Sums> = Box::new([[0.0; 4]; N_PARTS]);
+    for (code, splat_ix) in members {
+        let part = &mut sums[cell.part_of(*code)];
+        let area = area(splats, *splat_ix);
+        let color = splats.sh[*splat_ix as usize * splats.n_coefficients()];
+        part[0] += area;
+        for (sum, coefficient) in part[1..].iter_mut().zip(color) {
+            *sum += area * (0.5 + codec::SH_0 * f64::from(coefficient));
+        }
+    }
+    sums
+}
+
+/// Visible area that has changed, in square meters up to a constant factor.
+fn change(before: Option<&Content>, after: &Content) -> f64 {
+    let values = |content: &Content| content.sums.as_flattened().to_vec();
+    let after = values(after);
+    let before = before.map_or_else(|| vec![0.0; after.len()], values);
+    let difference: f64 = after.iter().zip(&before).map(|(after, before)| (after - before).abs()).sum();
+    difference + MIN_CHANGE_FRAC * after.iter().map(|sum| sum.abs()).sum::<f64>()
+}
+
+#[cfg(test)]
+mod tests;

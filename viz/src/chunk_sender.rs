@@ -1,0 +1,235 @@
+//! Decides which chunk of a model a client receives next: first all chunks coarsely, then all in full, then the chunks
+//! that have changed most, within a budget.
+
+use crate::chunk_list::{ChunkList, VersionedChunk};
+use crate::pose::row_major;
+use crate::server_message::{BinaryHeader, ChunkHeader, ServerMessage, frame};
+use crate::subscriptions::ChunkSubscription;
+use axum::extract::ws::Message;
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+/// Unused budget is saved for at most this time, seconds.
+const MAX_SAVED_SECS: f64 = 0.1;
+/// New chunks may exceed the budget. Changes make up for at most this time, seconds.
+const MAX_DEBT_SECS: f64 = 1.0;
+
+/// What a client has of a model.
+#[derive(Debug, Default)]
+pub(crate) struct ChunkSender {
+    /// Number of the subscription that the chunks belong to.
+    n_subscriptions: u64,
+    /// Chunks by id.
+    sent: BTreeMap<u64, SentChunk>,
+    /// Bytes that may be spent on changes, and when they were last updated.
+    balance_bytes: f64,
+    updated: Option<Instant>,
+}
+
+/// What a client has of a chunk.
+#[derive(Clone, Copy, Debug)]
+struct SentChunk {
+    version: u64,
+    is_fine: bool,
+    total_change: f64,
+}
+
+/// What to do next.
+#[derive(Debug)]
+pub(crate) enum NextChunk {
+    /// Sends this message.
+    Send(Message),
+    /// The budget allows the next message at this time.
+    WaitUntil(Instant),
+    /// The client has everything.
+    Wait,
+}
+
+impl ChunkSender {
+    /// The next message, which counts as sent.
+    pub(crate) fn next(&mut self, list: &ChunkList, subscription: &ChunkSubscription, now: Instant) -> NextChunk {
+        if subscription.number != self.n_subscriptions {
+            *self = Self { n_subscriptions: subscription.number, ..Self::default() };
+        }
+        self.refill(subscription.max_bytes_per_sec, now);
+        let unsent = |chunk: &&Arc<VersionedChunk>| !self.sent.contains_key(&chunk.chunk.id);
+        if let Some(chunk) = most_changed(list.chunks.values().filter(unsent), |chunk| chunk.total_change) {
+            let is_fine = chunk.chunk.coarse.is_none();
+            return self.send(list, &chunk, is_fine, subscription);
+        }
+        // Removed chunks were replaced by others, which the client has by now.
+        if self.sent.keys().any(|id| !list.chunks.contains_key(id)) {
+            let (kept, removed): (BTreeMap<_, _>, BTreeMap<_, _>) =
+                std::mem::take(&mut self.sent).into_iter().partition(|(id, _)| list.chunks.contains_key(id));
+            self.sent = kept;
+            let ids = removed.into_keys().collect();
+            let message = ServerMessage::ModelChunksRemoved { method: &subscription.method, ids };
+            return NextChunk::Send(Message::text(message.to_json()));
+        }
+        let is_coarse = |chunk: &&Arc<VersionedChunk>| self.sent.get(&chunk.chunk.id).is_some_and(|sent| !sent.is_fine);
+        if let Some(chunk) = most_changed(list.chunks.values().filter(is_coarse), |chunk| chunk.total_change) {
+            return self.send(list, &chunk, true, subscription);
+        }
+        let missed = |chunk: &VersionedChunk| {
+            chunk.total_change - self.sent.get(&chunk.chunk.id).map_or(0.0, |sent| sent.total_change)
+        };
+        let is_outdated = |chunk: &&Arc<VersionedChunk>| {
+            self.sent.get(&chunk.chunk.id).is_some_and(|sent| sent.version != chunk.version)
+        };
+        let Some(chunk) = most_changed(list.chunks.values().filter(is_outdated), missed) else {
+            return NextChunk::Wait;
+        };
+        if self.balance_bytes < 0.0 {
+            let secs = -self.balance_bytes / subscription.max_bytes_per_sec;
+            return NextChunk::WaitUntil(now + Duration::from_secs_f64(secs));
+        }
+        self.send(list, &chunk, true, subscription)
+    }
+
+    fn refill(&mut self, bytes_per_sec: f64, now: Instant) {
+        let secs = self.updated.map_or(0.0, |updated| (now - updated).as_secs_f64());
+        self.updated = Some(now);
+        self.balance_bytes = (self.balance_bytes + secs * bytes_per_sec).min(MAX_SAVED_SECS * bytes_per_sec);
+    }
+
+    fn send(
+        &mut self,
+        list: &ChunkList,
+        chunk: &VersionedChunk,
+        is_fine: bool,
+        subscription: &ChunkSubscription,
+    ) -> NextChunk {
+        let VersionedChunk { version, total_change, chunk } = chunk;
+        self.sent.insert(chunk.id, SentChunk { version: *version, is_fine, total_change: *total_change });
+        let n_incomplete = list.chunks.keys().filter(|id| !self.sent.get(id).is_some_and(|sent| sent.is_fine)).count();
+        let data = if is_fine { &chunk.fine } else { chunk.coarse.as_ref().unwrap_or(&chunk.fine) };
+        let header = ChunkHeader {
+            method: &subscription.method,
+            id: chunk.id,
+            is_coarse: !is_fine,
+            n_chunks: list.chunks.len(),
+            n_incomplete,
+            world_from_model: row_major(&list.world_from_model),
+            layout: data.layout,
+        };
+        let bytes = frame(&BinaryHeader::ModelChunk(&header), &[&data.bytes]);
+        let max_debt_bytes = MAX_DEBT_SECS * subscription.max_bytes_per_sec;
+        self.balance_bytes = (self.balance_bytes - bytes.len() as f64).max(-max_debt_bytes);
+        NextChunk::Send(Message::binary(bytes))
+    }
+}
+
+fn most_changed<'a>(
+    chunks: impl Iterator<Item = &'a Arc<VersionedChunk>>,
+    change: impl Fn(&VersionedChunk) -> f64,
+) -> Option<Arc<VersionedChunk>> {
+    chunks.max_by(|a, b| change(a).total_cmp(&change(b))).map(Arc::clone)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{ChunkSender, NextChunk};
+    use crate::chunk_list::ChunkList;
+    use crate::chunk_list::tests::{chunk, complete};
+    use crate::subscriptions::ChunkSubscription;
+    use axum::extract::ws::Message;
+    use serde_json::Value;
+    use std::time::{Duration, Instant};
+    use trainer::ModelChunks;
+
+    fn subscription(number: u64) -> ChunkSubscription {
+        ChunkSubscription { number, method: "tsdf".into(), period: Duration::from_secs(1), max_bytes_per_sec: 1e5 }
+    }
+
+    fn changes(chunks: Vec<trainer::ModelChunk>, removed: Vec<u64>) -> ModelChunks {
+        ModelChunks { is_complete: false, chunks, removed }
+    }
+
+    /// A client that receives everything at once.
+    struct Receiver {
+        sender: ChunkSender,
+        number: u64,
+        now: Instant,
+        n_bytes: usize,
+    }
+
+    impl Receiver {
+        fn new() -> Self {
+            Self { sender: ChunkSender::default(), number: 1, now: Instant::now(), n_bytes: 0 }
+        }
+
+        /// Receives until nothing more is sent now. Returns `id` or `id coarse` of chunks, and `- ids` of removed ones.
+        fn receive(&mut self, list: &ChunkList) -> Vec<String> {
+            let mut received = Vec::new();
+            while let NextChunk::Send(message) = self.sender.next(list, &subscription(self.number), self.now) {
+                received.push(match message {
+                    Message::Binary(bytes) => {
+                        self.n_bytes += bytes.len();
+                        let n_header = u32::from_le_bytes(bytes[..4].try_into().expect("4 bytes")) as usize;
+                        let header: Value = serde_json::from_slice(&bytes[4..4 + n_header]).expect("JSON");
+                        let suffix = if header["is_coarse"] == true { " coarse" } else { "" };
+                        format!("{}{suffix}", header["id"])
+                    }
+                    other => {
+                        let text: Value = serde_json::from_str(&other.into_text().expect("text")).expect("JSON");
+                        format!("- {}", text["ids"])
+                    }
+                });
+            }
+            received
+        }
+    }
+
+    #[test]
+    fn all_chunks_come_coarsely_first_then_in_full() {
+        let mut list = ChunkList::default();
+        let mut client = Receiver::new();
+        list.apply(complete(vec![chunk(1, 1.0, 100_000), chunk(2, 3.0, 100_000), chunk(3, 2.0, 100_000)]));
+        // The budget does not apply to chunks that the client does not have.
+        assert_eq!(client.receive(&list), ["2 coarse", "3 coarse", "1 coarse", "2", "3", "1"]);
+        assert!(client.receive(&list).is_empty());
+        client.number = 2;
+        assert_eq!(client.receive(&list).len(), 6, "a new subscription begins with all chunks");
+    }
+
+    #[test]
+    fn removed_chunks_disappear_after_their_replacements_have_come() {
+        let mut list = ChunkList::default();
+        let mut client = Receiver::new();
+        list.apply(complete(vec![chunk(1, 1.0, 1000), chunk(2, 1.0, 1000)]));
+        client.receive(&list);
+        list.apply(changes(vec![chunk(10, 1.0, 1000), chunk(11, 2.0, 1000)], vec![1]));
+        assert_eq!(client.receive(&list), ["11 coarse", "10 coarse", "- [1]", "11", "10"]);
+        list.apply(complete(Vec::new()));
+        assert_eq!(client.receive(&list), ["- [2,10,11]"]);
+    }
+
+    #[test]
+    fn changes_stay_within_the_budget_and_the_largest_come_first() {
+        let mut list = ChunkList::default();
+        let mut client = Receiver::new();
+        let model = |change: fn(u64) -> f64| (0..50).map(|id| chunk(id, change(id), 20_000)).collect::<Vec<_>>();
+        list.apply(complete(model(|_| 1.0)));
+        client.receive(&list);
+        client.n_bytes = 0;
+        let mut times = std::collections::BTreeMap::<String, usize>::new();
+        for step in 0..600 {
+            client.now += Duration::from_millis(100);
+            if step % 10 == 0 {
+                // Ten chunks change five times as much as the others.
+                list.apply(changes(model(|id| if id < 10 { 5.0 } else { 1.0 }), Vec::new()));
+            }
+            client.receive(&list).into_iter().for_each(|id| *times.entry(id).or_default() += 1);
+        }
+        // 60 s at 100 kB/s, with at most one chunk and a tenth of a second too many.
+        assert!((5_700_000..6_040_000).contains(&client.n_bytes), "{} bytes", client.n_bytes);
+        assert_eq!(times.len(), 50, "every chunk is updated at some time");
+        let mean = |ids: std::ops::Range<u64>| {
+            let n = ids.end - ids.start;
+            ids.map(|id| times[&id.to_string()]).sum::<usize>() as f64 / n as f64
+        };
+        let ratio = mean(0..10) / mean(10..50);
+        assert!((3.0..7.0).contains(&ratio), "{ratio}");
+    }
+}

@@ -1,0 +1,134 @@
+//! Opens the bundled page in a real browser, lets it draw models itself, and compares them with the server's pictures.
+//!
+//! Skipped, with a message, if Chromium or the bundle (`make web`) is missing.
+
+#[expect(dead_code, reason = "another test measures tasks")]
+mod browser;
+mod models;
+
+use browser::{Browser, canvas_shot, chromium, wait_for};
+use kinematics::Transform;
+use models::{ModelThread, splat_model, tsdf_model, wall};
+use nalgebra::{Point3, UnitQuaternion, Vector3};
+use std::path::PathBuf;
+use std::time::{Duration, Instant};
+use trainer::eval::{PixelPair, psnr};
+use trainer::{Method, RenderRequest};
+use viz::{Hub, ModelStatus, SceneHint, Server, ServerConfig, Status};
+
+const WINDOW_PX: [u32; 2] = [1000, 640];
+/// Required PSNR of the page's own drawing against the server's picture, dB.
+const MIN_DB: f64 = 30.0;
+/// Part of the view that nothing else covers: distance from its top and bottom edges, pixels.
+const MARGIN_PX: usize = 90;
+/// Drawing is slow without a GPU.
+const TIMEOUT: Duration = Duration::from_secs(60);
+
+/// PSNR of the middle rows of a screenshot.
+fn shot_psnr(request: &RenderRequest, shot: &image::RgbImage, rgba: &[u8]) -> f64 {
+    let [width, height] = request.size_px;
+    assert_eq!([shot.width(), shot.height()], request.size_px);
+    let rows = MARGIN_PX..height as usize - MARGIN_PX;
+    let pixels = rows.start * width as usize..rows.end * width as usize;
+    let shown: Vec<u8> = shot.pixels().flat_map(|pixel| [pixel.0[0], pixel.0[1], pixel.0[2], 255]).collect();
+    let middle = |all: &[u8]| all[4 * pixels.start..4 * pixels.end].to_vec();
+    let mut expected = middle(rgba);
+    expected.chunks_exact_mut(4).for_each(|pixel| pixel[3] = 255);
+    let size_px = [width, u32::try_from(rows.len()).expect("small")];
+    psnr(&PixelPair::new(size_px, &middle(&shown), &expected).expect("sizes")).expect("a score")
+}
+
+/// Waits until the page shows the model as the server does.
+fn check_local(browser: &mut Browser, thread: &ModelThread, model: &mut dyn Method, (name, min_db): (&str, f64)) {
+    wait_for(browser, "all parts of the model", |browser| {
+        let text = browser.text("picture-text");
+        text.contains("drawn here") && !text.contains(" of ")
+    });
+    let began = Instant::now();
+    loop {
+        let request = thread.last_request();
+        let picture = model.render(&request).expect("drawn");
+        let shot = canvas_shot(browser);
+        let db = shot_psnr(&request, &shot, &picture.rgba_srgb);
+        if db >= min_db || began.elapsed() > TIMEOUT {
+            let scratch = PathBuf::from(env!("CARGO_TARGET_TMPDIR"));
+            shot.save(scratch.join(format!("page-local-{name}.png"))).expect("written");
+            let [width, height] = request.size_px;
+            let expected = image::RgbaImage::from_raw(width, height, picture.rgba_srgb).expect("the size");
+            let expected = image::DynamicImage::from(expected).to_rgb8();
+            expected.save(scratch.join(format!("page-server-{name}.png"))).expect("written");
+            eprintln!("{name}: {db:.1} dB");
+            assert!(db >= min_db, "{name}: {db} dB");
+            return;
+        }
+        std::thread::sleep(Duration::from_millis(300));
+    }
+}
+
+#[test]
+fn local_drawing_equals_the_pictures_of_the_server() {
+    let bundle = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("web/dist/app.js");
+    let Some(program) = chromium().filter(|_| bundle.is_file()) else {
+        eprintln!("page test skipped: it needs Chromium and the bundled page (make web)");
+        return;
+    };
+    let hub = Hub::new();
+    // Upright, and not along an axis.
+    let eye = Point3::new(0.5, -2.9, 0.6);
+    let upright = UnitQuaternion::face_towards(&(Point3::new(0.0, 0.0, 0.1) - eye), &-Vector3::z());
+    hub.set_scene_hint(SceneHint {
+        center_m: [0.0, 0.0, 0.1],
+        radius_m: 1.5,
+        world_from_camera: Transform::from_parts(eye.into(), upright),
+    });
+    let status = |method: &str| ModelStatus { method: method.to_owned(), has_chunks: true, ..ModelStatus::default() };
+    let nerf = ModelStatus { method: "nerf".to_owned(), ..ModelStatus::default() };
+    hub.set_status(Status { model: status("splat"), others: vec![status("tsdf"), nerf], ..Status::default() });
+    // More than the page reserves memory for at first.
+    let splats = wall(80_000);
+    let models: models::Models = vec![("splat", Box::new(splat_model(&splats))), ("tsdf", Box::new(tsdf_model(18)))];
+    let (mut reference_splats, mut reference_tsdf) = (splat_model(&splats), tsdf_model(18));
+    let thread = ModelThread::start(hub.clone(), models);
+    let server = Server::start(ServerConfig { listen: ([127, 0, 0, 1], 0).into() }, hub.clone()).expect("a free port");
+    let scratch = PathBuf::from(env!("CARGO_TARGET_TMPDIR"));
+    let profile = scratch.join(format!("chromium-local-{}", std::process::id()));
+    let mut browser = Browser::open(&program, &profile, &server.url(), WINDOW_PX);
+    wait_for(&mut browser, "a full picture", |browser| browser.text("picture-text").contains("100 %"));
+    browser.click("toggle-grid");
+    browser.click("toggle-local");
+    check_local(&mut browser, &thread, &mut reference_splats, ("splat", MIN_DB));
+
+    // The view moves without pictures from the server, which is asked only for depth when the view rests.
+    let (before, n_color_requests) = (thread.last_request(), thread.n_color_requests());
+    let [x, y] = [400, 300];
+    browser.mouse("mousePressed", [x, y]);
+    for step in 1..=10 {
+        browser.mouse("mouseMoved", [x + 4 * step, y]);
+        browser.next_frame();
+    }
+    browser.mouse("mouseReleased", [x + 40, y]);
+    wait_for(&mut browser, "the depth of the new view", |_| {
+        thread.last_request().world_from_camera != before.world_from_camera
+    });
+    check_local(&mut browser, &thread, &mut reference_splats, ("splat-moved", MIN_DB));
+    assert_eq!(thread.n_color_requests(), n_color_requests);
+
+    browser.evaluate("document.querySelector('[data-method=tsdf]').click()");
+    wait_for(&mut browser, "the other model", |_| hub.chunk_period("tsdf").is_some());
+    assert!(hub.chunk_period("splat").is_none() && !hub.has_model_chunks("splat"), "its memory is free");
+    check_local(&mut browser, &thread, &mut reference_tsdf, ("tsdf", MIN_DB));
+    browser.click("toggle-crop");
+    wait_for(&mut browser, "the crop", |_| thread.last_request().crop.is_some());
+    // The edges and handles of the box are drawn, too.
+    check_local(&mut browser, &thread, &mut reference_tsdf, ("tsdf-cropped", 20.0));
+    browser.click("toggle-crop");
+
+    // Models that the page cannot draw come from the server.
+    browser.evaluate("document.querySelector('[data-method=nerf]').click()");
+    wait_for(&mut browser, "no local model", |browser| {
+        browser.evaluate("document.getElementById('toggle-local').hidden") == true
+    });
+    drop(browser);
+    drop(thread.finish());
+    std::fs::remove_dir_all(&profile).expect("the browser has left its profile");
+}
