@@ -15,7 +15,7 @@ pub(crate) struct PageArgs {
     /// and `calibrate` take a free port if that one is in use]
     #[arg(long, value_name = "ADDRESS", value_parser = address)]
     listen: Option<SocketAddr>,
-    /// Let other machines open the page: encrypted, and only with a token, which is part of the printed addresses
+    /// Serve the page to other machines over TLS; the printed addresses contain the required token
     #[arg(long)]
     share: bool,
     /// TLS certificate for --share, with its chain (PEM) [default: self-signed, kept for later runs]

@@ -174,6 +174,11 @@ pub(crate) fn report(text: impl Display) {
     }
 }
 
+/// Prints one line for the user to stderr. Unlike the log, it may contain a token.
+pub(crate) fn notice(text: impl Display) {
+    let _ = BARS.suspend(|| WRITER.try_send(OutputChunk::Err(format!("{text}\n").into_bytes())));
+}
+
 /// Prints the error that ends the program to stderr. Like the log, it goes through the writer thread, so a terminal
 /// that accepts no output does not prevent the program from exiting with the right code.
 pub(crate) fn error(error: &anyhow::Error) {

@@ -79,23 +79,27 @@ impl ServedPage {
     }
 
     fn print_lines(&self) -> anyhow::Result<()> {
-        let url = self.url();
-        print::report(format_args!("open {url} in a browser"));
-        if let Some(url) = self.foxglove_url() {
-            print::report(format_args!("open the connection {url} in Foxglove"));
-        }
-        let Some(shared) = &self.shared else { return Ok(()) };
-        print::report(format_args!("to let others watch without control, give them {}", shared.viewer_url));
-        if !shared.other_addresses.is_empty() {
-            let others: Vec<String> = shared.other_addresses.iter().map(ToString::to_string).collect();
-            print::report(format_args!("other addresses of this computer: {}", others.join(", ")));
-        }
-        let remark = if shared.is_self_signed { ", of which browsers warn once; compare this value" } else { "" };
-        print::report(format_args!("SHA-256 fingerprint of the certificate{remark}: {}", shared.fingerprint));
-        if std::io::stdout().is_terminal() {
-            print::report(qr_code(&url)?);
+        self.lines().iter().for_each(print::report);
+        if self.shared.is_some() && std::io::stdout().is_terminal() {
+            print::report(qr_code(&self.url())?);
         }
         Ok(())
+    }
+
+    /// The addresses of the page, and what else clients need to know. They contain the tokens, so they must not be logged.
+    pub(crate) fn lines(&self) -> Vec<String> {
+        let mut lines = vec![format!("open {} in a browser", self.url())];
+        lines.extend(self.foxglove_url().map(|url| format!("open the connection {url} in Foxglove")));
+        let Some(shared) = &self.shared else { return lines };
+        lines.push(format!("view-only address: {}", shared.viewer_url));
+        if !shared.other_addresses.is_empty() {
+            let others: Vec<String> = shared.other_addresses.iter().map(ToString::to_string).collect();
+            lines.push(format!("other addresses of this computer: {}", others.join(", ")));
+        }
+        let remark =
+            if shared.is_self_signed { " (self-signed: the browser warns once; compare this value first)" } else { "" };
+        lines.push(format!("certificate SHA-256: {}{remark}", shared.fingerprint));
+        lines
     }
 }
 

@@ -482,7 +482,7 @@ fn pause_save_and_resume(url: &str) {
         }
     };
     let paused_at = number(&request("pause", &|status| status["state"] == "paused"), "step");
-    let is_saved = |status: &Value| status["notes"].to_string().contains("checkpoint taken after");
+    let is_saved = |status: &Value| status["notes"].to_string().contains("checkpoint requested after");
     let saved_at = number(&request("save", &is_saved), "step");
     assert_eq!(saved_at, paused_at, "no step while paused");
     request("resume", &|status| status["state"] == "training" && number(status, "step") > paused_at);

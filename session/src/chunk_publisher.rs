@@ -1,6 +1,6 @@
 //! Publishes the chunks of models that clients draw themselves, without delaying training.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 use trainer::{Error, Method, ModelChunks, ModelKind};
@@ -8,6 +8,8 @@ use viz::Hub;
 
 /// Minimum time between two versions of a model, because each one is read from the GPU and encoded as a whole.
 const MIN_PERIOD: Duration = Duration::from_millis(500);
+/// Pause after a failure.
+const RETRY_PERIOD: Duration = Duration::from_secs(10);
 /// Maximum fraction of the time that encoding takes.
 const MAX_ENCODE_FRAC: f64 = 0.25;
 
@@ -16,6 +18,8 @@ pub(crate) struct ChunkPublisher {
     hub: Hub,
     task: Option<Encoding>,
     models: BTreeMap<&'static str, Published>,
+    /// Models whose last encoding failed.
+    failed: BTreeSet<&'static str>,
 }
 
 /// A model that is being encoded.
@@ -35,20 +39,21 @@ struct Published {
 impl ChunkPublisher {
     /// A publisher for the clients of a hub.
     pub(crate) fn new(hub: Hub) -> Self {
-        Self { hub, task: None, models: BTreeMap::new() }
+        Self { hub, task: None, models: BTreeMap::new(), failed: BTreeSet::new() }
     }
 
     /// Publishes chunks that are encoded, and starts to encode the model if a client draws it and it has changed.
-    /// Returns the time spent, during which the model could not train.
-    pub(crate) fn publish(&mut self, kind: ModelKind, method: &mut dyn Method) -> Result<Duration, Error> {
+    /// Returns the time spent, during which the model could not train. A failure does not affect the run: a lost device is
+    /// detected by training, too.
+    pub(crate) fn publish(&mut self, kind: ModelKind, method: &mut dyn Method) -> Duration {
         let began = Instant::now();
-        self.finish()?;
+        self.finish();
         let name = kind.name();
         let Some(period) = self.hub.chunk_period(name) else {
             self.models.remove(name);
-            return Ok(began.elapsed());
+            return began.elapsed();
         };
-        let only_changed = self.hub.has_model_chunks(name);
+        let only_changed = self.hub.has_model_chunks(name) && !self.failed.contains(name);
         let step = method.progress().step;
         let is_due = match self.models.get(name) {
             Some(published) if only_changed => published.step != step && began >= published.next_at,
@@ -56,30 +61,44 @@ impl ChunkPublisher {
             None => true,
         };
         if self.task.is_some() || !is_due {
-            return Ok(began.elapsed());
+            return began.elapsed();
         }
         self.models.insert(name, Published { step, next_at: began + period.max(MIN_PERIOD) });
-        if let Some(pending) = method.queue_chunks(only_changed)? {
-            self.task = Some(Encoding { name, began, thread: std::thread::spawn(|| pending.finish()) });
+        match method.queue_chunks(only_changed) {
+            Ok(None) => {}
+            Ok(Some(pending)) => {
+                self.task = Some(Encoding { name, began, thread: std::thread::spawn(|| pending.finish()) });
+            }
+            Err(error) => self.fail(name, &error.to_string()),
         }
-        Ok(began.elapsed())
+        began.elapsed()
     }
 
     /// Publishes the chunks that are encoded.
-    fn finish(&mut self) -> Result<(), Error> {
+    fn finish(&mut self) {
         let Some(Encoding { name, began, thread }) = self.task.take_if(|task| task.thread.is_finished()) else {
-            return Ok(());
+            return;
         };
         let pause = Duration::from_secs_f64(began.elapsed().as_secs_f64() / MAX_ENCODE_FRAC);
         if let Some(published) = self.models.get_mut(name) {
             published.next_at = published.next_at.max(began + pause);
         }
         match thread.join() {
-            Ok(Ok(chunks)) => self.hub.set_model_chunks(name, chunks),
-            Ok(Err(error)) if error.is_gpu_error() => return Err(error),
-            Ok(Err(error)) => log::error!("cannot send the model to viewers: {error}"),
-            Err(_) => log::error!("encoding the model for viewers panicked"),
+            Ok(Ok(chunks)) => {
+                self.failed.remove(name);
+                self.hub.set_model_chunks(name, chunks);
+            }
+            Ok(Err(error)) => self.fail(name, &error.to_string()),
+            Err(_) => self.fail(name, "encoding panicked"),
         }
-        Ok(())
+    }
+
+    /// Tries again later, with all chunks, because the changes since the last version are lost.
+    fn fail(&mut self, name: &'static str, reason: &str) {
+        log::warn!("cannot send the model {name} to viewers: {reason}");
+        self.failed.insert(name);
+        if let Some(published) = self.models.get_mut(name) {
+            published.next_at = Instant::now() + RETRY_PERIOD;
+        }
     }
 }

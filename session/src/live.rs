@@ -211,12 +211,12 @@ impl Live {
 
     /// Runs one cycle: takes keyframes, trains, draws and publishes. Reopens the GPU if it fails.
     pub fn advance(&mut self) -> crate::Result<()> {
+        self.apply_controls();
         let advanced = self
-            .apply_controls()
-            .and_then(|()| self.take_keyframes())
+            .take_keyframes()
             .and_then(|()| self.step())
             .and_then(|()| self.render())
-            .and_then(|()| self.publish_chunks())
+            .map(|()| self.publish_chunks())
             .and_then(|()| self.publish());
         advanced.or_else(|error| self.recoveries.recover(&mut self.sessions, error))
     }
@@ -235,27 +235,26 @@ impl Live {
     }
 
     /// Applies the actions that operators have requested. An evaluation is completed first.
-    fn apply_controls(&mut self) -> crate::Result<()> {
+    fn apply_controls(&mut self) {
         if self.is_scoring() {
-            return Ok(());
+            return;
         }
         for control in self.hub.take_controls() {
             match control {
                 Control::Pause => self.is_paused = true,
                 Control::Resume => self.is_paused = false,
                 Control::Save => {
-                    let mut is_written = true;
+                    let mut is_due = true;
                     for session in &mut self.sessions {
-                        is_written &= session.save_checkpoint()?;
+                        is_due &= session.request_checkpoint();
                     }
-                    self.checkpoint_note = Some(match is_written {
-                        true => format!("checkpoint taken after {:.0} s", self.sessions[0].secs()),
+                    self.checkpoint_note = Some(match is_due {
+                        true => format!("checkpoint requested after {:.0} s", self.sessions[0].secs()),
                         false => "this run writes no checkpoints".to_owned(),
                     });
                 }
             }
         }
-        Ok(())
     }
 
     /// Pushes new keyframes to the models: all waiting keyframes in real time, or the keyframe that is due in lockstep.
@@ -340,6 +339,10 @@ impl Live {
             session.score_next()?;
             self.budget.add_training(before.elapsed());
             return Ok(());
+        }
+        if self.is_paused {
+            // Keyframes are still accepted, and checkpoints can be requested.
+            self.sessions.iter_mut().try_for_each(Session::write_checkpoint_when_due)?;
         }
         if self.is_finished() || self.is_paused {
             self.hub.wait_for_request(IDLE);
@@ -460,13 +463,12 @@ impl Live {
     }
 
     /// Publishes the models that clients draw themselves. Pictures and chunks share one budget.
-    fn publish_chunks(&mut self) -> crate::Result<()> {
+    fn publish_chunks(&mut self) {
         if !self.is_scoring() && self.budget.may_render() {
             for session in &mut self.sessions {
-                self.budget.add_render(session.publish_chunks(&mut self.chunk_publisher)?);
+                self.budget.add_render(session.publish_chunks(&mut self.chunk_publisher));
             }
         }
-        Ok(())
     }
 
     /// Publishes the status of the run to viewers, a few times per second.

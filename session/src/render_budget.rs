@@ -1,7 +1,7 @@
 //! Limits the share of time that is spent on drawing pictures during training.
 //!
 //! Each second of training adds credit for pictures: a second on a software adapter, 0.66 seconds on a GPU. Pictures
-//! are drawn immediately while credit is left. Training therefore keeps at least 1/2 or 5/8 of the time, unless a single
+//! are drawn immediately while credit is left. Training therefore keeps at least 1/2 or 3/5 of the time, unless a single
 //! picture takes longer than the maximum debt.
 
 use std::time::Duration;

@@ -224,8 +224,8 @@ impl Session {
     }
 
     /// Publishes the chunks of the model if they are due. Returns the time spent.
-    pub(crate) fn publish_chunks(&mut self, publisher: &mut ChunkPublisher) -> crate::Result<Duration> {
-        Ok(publisher.publish(self.kind(), self.method.as_mut())?)
+    pub(crate) fn publish_chunks(&mut self, publisher: &mut ChunkPublisher) -> Duration {
+        publisher.publish(self.kind(), self.method.as_mut())
     }
 
     /// Waits for queued work and returns the total number of updates, including those of trials.
@@ -300,8 +300,10 @@ impl Session {
     pub(crate) fn pause_growth(&mut self, is_paused: bool) -> crate::Result<()> {
         if self.method.pause_growth(is_paused)? {
             let Progress { primitives, step_millis, .. } = self.progress();
-            let verb = if is_paused { "stops" } else { "continues" };
-            log::info!("the model {verb} growing at {primitives} splats, because a step takes {step_millis:.0} ms");
+            let change = if is_paused { "is paused" } else { "continues" };
+            log::info!(
+                "growth {change} at {primitives} splats: a step takes {step_millis:.0} ms, limit {MAX_LIVE_STEP_MILLIS} ms"
+            );
             self.persistence.log_growth_pause(self.method.as_mut(), is_paused)?;
         }
         Ok(())
@@ -430,11 +432,16 @@ impl Session {
         Ok(())
     }
 
-    /// Writes a checkpoint now, if none is being written. Returns false if the run writes no checkpoints.
-    pub fn save_checkpoint(&mut self) -> crate::Result<bool> {
-        let is_requested = self.persistence.request_checkpoint();
-        self.evaluate_when_due()?;
-        Ok(is_requested)
+    /// Makes the next checkpoint due now. Returns false if the run writes no checkpoints.
+    pub(crate) fn request_checkpoint(&mut self) -> bool {
+        self.persistence.request_checkpoint()
+    }
+
+    /// Writes a checkpoint, or the new keyframes, if they are due.
+    pub(crate) fn write_checkpoint_when_due(&mut self) -> crate::Result<()> {
+        let seconds = self.secs();
+        let (method, keyframes) = (self.method.as_mut(), &self.keyframes[..]);
+        self.persistence.write_checkpoint_when_due(Snapshot { method, keyframes, seconds, is_finished: false })
     }
 
     /// Writes a checkpoint if one is due, and evaluates if an evaluation is due. A finished session does neither.
@@ -442,9 +449,7 @@ impl Session {
         if self.time.is_finished() {
             return Ok(());
         }
-        let seconds = self.secs();
-        let (method, keyframes) = (self.method.as_mut(), &self.keyframes[..]);
-        self.persistence.write_checkpoint_when_due(Snapshot { method, keyframes, seconds, is_finished: false })?;
+        self.write_checkpoint_when_due()?;
         if self.scoreboard.is_due(self.secs()) {
             // The evaluation scores the model after all steps queued so far.
             self.method.n_total_steps()?;

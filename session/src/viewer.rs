@@ -55,9 +55,7 @@ impl ModelViewer {
 
     fn publish_chunks(&mut self) {
         for ServedModel { kind, method } in &mut self.models {
-            if let Err(error) = self.chunk_publisher.publish(*kind, method.as_mut()) {
-                log::error!("cannot send the model to viewers: {error}");
-            }
+            self.chunk_publisher.publish(*kind, method.as_mut());
         }
     }
 

@@ -99,7 +99,7 @@ pub(crate) enum Refusal {
     ForeignPage,
     #[error("this server requires a token: open the complete address that fieldrig printed when it started")]
     NoToken,
-    #[error("the token is not valid, because it changes at each start: open the address that fieldrig printed last")]
+    #[error("invalid token: tokens change at each start; open the most recently printed address")]
     WrongToken,
 }
 

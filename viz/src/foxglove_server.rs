@@ -241,8 +241,7 @@ async fn publish_lists(topics: &Topics) {
             let newest = keyframes.iter().map(|keyframe| keyframe.stamp).max().unwrap_or_default();
             topics.keyframes.log_with_time(&poses_in_frame(&keyframes, newest), nanos(newest));
         }
-        let latest = status.borrow_and_update().clone();
-        if let Some(status) = latest.filter(|_| has_status) {
+        if has_status && let Some(status) = status.borrow_and_update().clone() {
             let time = PartialMetadata::with_log_time(nanos(newest_stamp(&topics.hub)));
             topics.metrics.log_with_meta(metrics(&status).as_bytes(), time);
         }

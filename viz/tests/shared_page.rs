@@ -48,7 +48,7 @@ fn page_uses_its_token_and_shows_its_role() {
     std::fs::write(scratch.join("shared-no-token.png"), browser.screenshot()).expect("written");
     let open = |browser: &mut Browser, token: &str| browser.evaluate(&format!("location.hash = '#token={token}'"));
     open(&mut browser, "0123");
-    wait_for(&mut browser, "the reason", has_banner("The token is not valid"));
+    wait_for(&mut browser, "the reason", has_banner("Invalid token"));
     browser.resize(PHONE_PX);
     std::fs::write(scratch.join("shared-wrong-token-phone.png"), browser.screenshot()).expect("written");
     browser.resize(WINDOW_PX);

@@ -1,6 +1,7 @@
 //! The web page while images of a target are taken: the camera image, the corners found so far, and what to do next.
 
 use crate::page_args::PageArgs;
+use crate::print;
 use crate::served_page::ServedPage;
 use calibration::BoardView;
 use capture::config::Camera;
@@ -39,7 +40,8 @@ impl GuidancePage {
     pub(super) fn start(args: &PageArgs, camera: &Camera) -> anyhow::Result<Self> {
         let hub = Hub::new();
         let page = args.serve_or_free_port(&hub)?;
-        log::info!("camera images and guidance: open {} in a browser", page.url());
+        print::notice("the page shows camera images and what to do next:");
+        page.lines().iter().for_each(print::notice);
         let began = Instant::now();
         Ok(Self {
             hub,
@@ -92,7 +94,9 @@ impl GuidancePage {
     pub(super) fn show_searched(&mut self, size_px: [u32; 2], gray: &[u8], view: Option<&BoardView>) {
         let newest: Vec<[f64; 2]> = view.iter().flat_map(|view| &view.points).map(|point| point.pixel).collect();
         let rgb = gray.iter().flat_map(|value| [*value; 3]).collect();
-        self.publish(Stamp::default(), size_px, rgb, &newest);
+        // The stamp only has to differ from that of the previous image.
+        let stamp = Stamp::from_secs(self.began.elapsed().as_secs_f64());
+        self.publish(stamp, size_px, rgb, &newest);
         if view.is_some() {
             self.n_views += 1;
             self.next_live = Instant::now() + DETECTED_FOR;

@@ -5,13 +5,17 @@ import type { Role } from "./protocol";
 
 const VIEWER_REASON = "Only operators can do this; you are connected as viewer";
 
-/** Moves the token from the address to a cookie, with which the browser authenticates all requests to this server. */
-export function keepToken(): void {
+/**
+ * Moves the token from the address to a cookie, with which the browser authenticates all requests to this server.
+ * Returns whether there was a token.
+ */
+export function keepToken(): boolean {
   const token = new URLSearchParams(location.hash.slice(1)).get("token");
-  if (token === null || location.protocol !== "https:") return;
+  if (token === null || location.protocol !== "https:") return false;
   const name = `__Host-fieldrig-${location.port || "443"}`;
   document.cookie = `${name}=${encodeURIComponent(token)}; Path=/; Secure; SameSite=Strict`;
   history.replaceState(null, "", location.pathname + location.search);
+  return true;
 }
 
 /** Why the server refuses this page, in one sentence; empty if it does not, or does not answer. */

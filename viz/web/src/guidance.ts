@@ -1,4 +1,4 @@
-// While images are taken for a calibration, the page shows them in large, and what to do next.
+// While images are taken for a calibration, the page enlarges them, and shows what to do next.
 
 import type { Banner } from "./banner";
 import type { Guidance } from "./protocol";

@@ -23,13 +23,20 @@ import { ViewSettings } from "./view_settings";
 let stages = [0.1, 0.5, 1];
 let latestStatus: Status | null = null;
 let latestStep = -1;
+let showsModel = true;
 let liveCamera: LiveImageHeader | null = null;
 
 const readouts = new Readouts();
 const banner = new Banner();
 const view = new OrbitView(element("canvas", HTMLCanvasElement), () => scheduler.moved());
 keepToken();
-window.addEventListener("hashchange", keepToken);
+window.addEventListener("hashchange", () => {
+  if (keepToken()) location.reload(); // The server assigns the role when the page connects.
+});
+// A page that becomes visible subscribes anew, and gets all chunks again.
+document.addEventListener("visibilitychange", () => {
+  if (!document.hidden) view.local.clear();
+});
 const connection = new Connection(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/ws`, {
   state(state, text) {
     const shown = element("connection");
@@ -48,6 +55,7 @@ const connection = new Connection(`${location.protocol === "https:" ? "wss" : "w
       scheduler.restart();
       view.points.clear();
       view.scans.clear();
+      view.scans.setPath([]);
       view.local.clear();
       subscriptions.restart();
       element("toggle-points").hidden = !connection.supports("keyframe_points");
@@ -140,7 +148,7 @@ function showStatus(status: Status): void {
 function updateLocalModel(model: ModelStatus): void {
   const isPossible = connection.supports("model_chunks") && model.has_chunks === true;
   element("toggle-local").hidden = !isPossible;
-  const method = isPossible && isDrawnLocally ? model.method : null;
+  const method = isPossible && isDrawnLocally && showsModel ? model.method : null;
   view.local.method = method;
   subscriptions.localModel = method;
   scheduler.drawsLocally = method !== null;
@@ -229,7 +237,11 @@ action("look-live", "c", () => {
   if (liveCamera?.world_from_camera) view.lookFrom(liveCamera.world_from_camera);
 });
 element("look-live", HTMLButtonElement).disabled = true;
-toggle("toggle-model", "m", (isOn) => (view.showsModel = isOn));
+toggle("toggle-model", "m", (isOn) => {
+  showsModel = isOn;
+  view.showsModel = isOn;
+  if (latestStatus) showStatus(latestStatus);
+});
 toggle("toggle-local", "j", (isOn) => {
   isDrawnLocally = isOn;
   if (latestStatus) showStatus(latestStatus);

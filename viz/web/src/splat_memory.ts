@@ -104,8 +104,15 @@ function writeWords(texture: THREE.DataTexture, unit: number, words: Uint32Array
   updateRange(texture, begin, UNIT_WORDS);
 }
 
+/** Maximum number of ranges to upload; beyond it, everything is uploaded. A hidden layer uploads nothing. */
+const MAX_RANGES = 1000;
+
 /** Uploads only this range, or everything if the texture is new. */
 function updateRange(texture: THREE.DataTexture, start: number, count: number): void {
+  if (texture.updateRanges.length >= MAX_RANGES) {
+    texture.clearUpdateRanges();
+    texture.userData.isUploaded = false;
+  }
   if (texture.userData.isUploaded === true) texture.addUpdateRange(start, count);
   texture.needsUpdate = true;
 }

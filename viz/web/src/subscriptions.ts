@@ -106,7 +106,8 @@ export class Subscriptions {
       { ...images, size_px: this.showsLargeImages ? ENLARGED_PX : this.thumbnailPx() },
     ];
     for (const [camera, isEnlarged] of this.liveImages.resized) {
-      messages.push({ ...images, camera, size_px: isEnlarged && this.showsImages ? ENLARGED_PX : this.thumbnailPx() });
+      const isLarge = (isEnlarged && this.showsImages) || this.showsLargeImages;
+      messages.push({ ...images, camera, size_px: isLarge ? ENLARGED_PX : this.thumbnailPx() });
     }
     if (this.connection.supports("robot")) {
       messages.push({ type: "subscribe", topic: "robot_state", rate_hz: ROBOT_HZ });
