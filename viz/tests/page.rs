@@ -217,13 +217,20 @@ fn page_renders_scene_and_overlays_correctly() {
     check_switch(&mut browser, &render_thread);
     check_live_frustum(&mut browser, &full);
     check_picture(&mut browser, &full);
+    let turned = check_drag(&mut browser, &render_thread, &full);
+    check_picture(&mut browser, &turned);
+    std::fs::write(scratch.join("page-dragged.png"), browser.screenshot()).expect("written");
+    browser.click("reset-view");
+    wait_for(&mut browser, "the first view", |browser| {
+        let last = render_thread.requests().last().expect("drawn").clone();
+        let motion = full.world_from_camera.inverse() * last.world_from_camera;
+        let is_full = last.size_px == full.size_px && browser.text("picture-text").contains("100 %");
+        is_full && motion.translation.vector.norm() < 1e-6
+    });
     check_distance(&mut browser, &full);
     check_images(&mut browser);
     check_settings(&mut browser, &render_thread, &full);
     check_camera_path(&mut browser, &full);
-    let turned = check_drag(&mut browser, &render_thread, &full);
-    check_picture(&mut browser, &turned);
-    std::fs::write(scratch.join("page-dragged.png"), browser.screenshot()).expect("written");
     check_reconnect(&mut browser, server, &hub);
 
     drop(browser);

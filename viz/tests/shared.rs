@@ -124,7 +124,7 @@ fn data_requires_a_token_and_the_page_does_not() {
     let bearer = |token: &str| format!("Authorization: Bearer {token}\r\n");
     let cookie = format!("Cookie: __Host-fieldrig-7007={}\r\n", shared.viewer);
     for path in ["/status", "/robot/0.stl", "/ws"] {
-        for (headers, named) in [(String::new(), "requires a token"), (bearer("0123"), "not valid")] {
+        for (headers, named) in [(String::new(), "requires a token"), (bearer("0123"), "invalid token")] {
             let (head, body) = shared.get(path, &headers);
             assert!(head.starts_with("http/1.1 401"), "{path}: {head}");
             assert!(body.contains(named) && body.lines().count() == 1, "{path}: {body}");
