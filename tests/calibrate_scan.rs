@@ -379,8 +379,7 @@ fn scene_calibration_reports_the_pose_between_two_cameras() {
     for holder in [relative, &cameras["side"], &cameras["wrist"]] {
         for key in ["sigma_mm", "sigma_deg"] {
             let sigmas = numbers(&holder[key]);
-            // They include the discretization error, which is large in images this small.
-            assert!(sigmas.len() == 3 && sigmas.iter().all(|sigma| *sigma > 0.0 && *sigma < 2.0 * MAX_MM), "{holder}");
+            assert!(sigmas.len() == 3 && sigmas.iter().all(|sigma| *sigma > 0.0 && *sigma < MAX_MM), "{holder}");
         }
     }
 }

@@ -2,11 +2,11 @@
 //!
 //! `docs/reference/files.md` describes the layout.
 
+use crate::pending::Pending;
 use crate::{Error, atomic_file};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;
-use std::fmt::{Debug, Formatter};
 use std::io::Write;
 use std::path::Path;
 
@@ -46,7 +46,7 @@ pub struct Array {
 }
 
 /// Training state that is being read back from the GPU. Training may continue meanwhile.
-pub struct PendingCheckpoint(Box<dyn FnOnce() -> Result<Checkpoint, Error> + Send>);
+pub type PendingCheckpoint = Pending<Checkpoint>;
 
 /// The JSON header between preamble and arrays.
 #[derive(Serialize, Deserialize)]
@@ -68,24 +68,6 @@ struct Header {
 struct ArrayHeader {
     name: String,
     bytes: u64,
-}
-
-impl PendingCheckpoint {
-    /// Wraps a function that waits for the state.
-    pub fn new(finish: impl FnOnce() -> Result<Checkpoint, Error> + Send + 'static) -> Self {
-        Self(Box::new(finish))
-    }
-
-    /// Waits for the state.
-    pub fn finish(self) -> Result<Checkpoint, Error> {
-        (self.0)()
-    }
-}
-
-impl Debug for PendingCheckpoint {
-    fn fmt(&self, formatter: &mut Formatter<'_>) -> std::fmt::Result {
-        formatter.write_str("PendingCheckpoint")
-    }
 }
 
 impl Checkpoint {

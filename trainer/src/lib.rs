@@ -31,6 +31,7 @@ mod model_spec;
 pub mod nerf;
 pub mod optim;
 mod packing;
+mod pending;
 #[cfg(test)]
 mod random;
 mod registry;
@@ -58,5 +59,6 @@ pub use model_chunks::{ChunkData, ChunkLayout, ModelChunk, ModelChunks, PendingC
 pub use model_options::{AlignTiming, CommonOptions, MethodOptions, ModelOptions};
 pub use model_spec::{LoadedModel, ModelSpec, Resumed, load, resume};
 pub use packing::{JPEG_QUALITY, PackedDepth, PackedPicture, Packing, QueuedPicture, Rendered};
+pub use pending::Pending;
 pub use registry::ModelKind;
 pub use request::{Aabb, Picture, Projection, RenderRequest};

@@ -1,8 +1,7 @@
 //! Spatial parts of a model in a compact form, for clients that draw the model themselves.
 
-use crate::Error;
+use crate::pending::Pending;
 use serde::Serialize;
-use std::fmt::{Debug, Formatter};
 
 /// The chunks of a model at one moment.
 #[derive(Debug, Default)]
@@ -72,22 +71,4 @@ pub enum ChunkLayout {
 }
 
 /// Chunks that are being read from the GPU or encoded.
-pub struct PendingChunks(Box<dyn FnOnce() -> Result<ModelChunks, Error> + Send>);
-
-impl PendingChunks {
-    /// Wraps a function that waits for the chunks.
-    pub fn new(finish: impl FnOnce() -> Result<ModelChunks, Error> + Send + 'static) -> Self {
-        Self(Box::new(finish))
-    }
-
-    /// Waits for the chunks, on any thread. Encoding takes CPU time.
-    pub fn finish(self) -> Result<ModelChunks, Error> {
-        (self.0)()
-    }
-}
-
-impl Debug for PendingChunks {
-    fn fmt(&self, formatter: &mut Formatter<'_>) -> std::fmt::Result {
-        formatter.write_str("PendingChunks")
-    }
-}
+pub type PendingChunks = Pending<ModelChunks>;

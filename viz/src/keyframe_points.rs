@@ -1,8 +1,9 @@
 //! The depth of a keyframe as colored points, for viewers.
 
+use crate::positions::pack_positions;
 use crate::server_message::{BinaryHeader, PointsHeader, frame};
 use keyframe::{DepthMap, Keyframe};
-use nalgebra::Point3;
+use nalgebra::{Point3, Vector3};
 
 /// Maximum number of points per keyframe. A run has hundreds of keyframes that overlap.
 const MAX_POINTS: usize = 2500;
@@ -14,14 +15,7 @@ const MAX_EDGE_FRAC: f64 = 0.05;
 pub(crate) fn pack_points(id: u64, keyframe: &Keyframe) -> Option<Vec<u8>> {
     let is_complete = |depth: &&DepthMap| depth.depth_m.len() == n_pixels(depth.size_px);
     let (points, colors) = points_in_camera(keyframe, keyframe.depth.as_ref().filter(is_complete)?);
-    let extent_m = points.iter().flat_map(|point| point.coords.iter()).fold(0.0_f64, |max, value| max.max(value.abs()));
-    if points.is_empty() || extent_m <= 0.0 {
-        return None;
-    }
-    let meters_per_count = extent_m / f64::from(i16::MAX);
-    #[expect(clippy::cast_possible_truncation, reason = "the largest coordinate is i16::MAX counts")]
-    let count = |value: &f64| ((value / meters_per_count).round() as i16).to_le_bytes();
-    let positions: Vec<u8> = points.iter().flat_map(|point| point.coords.iter().flat_map(count)).collect();
+    let (positions, meters_per_count) = pack_positions(&points)?;
     let header = PointsHeader { id, n_points: points.len(), meters_per_count };
     Some(frame(&BinaryHeader::KeyframePoints(header), &[&positions, &colors]))
 }
@@ -31,7 +25,7 @@ fn n_pixels([width, height]: [u32; 2]) -> usize {
 }
 
 /// Points on a regular grid of the depth map, in the frame of the keyframe's color camera, and their colors.
-fn points_in_camera(keyframe: &Keyframe, depth: &DepthMap) -> (Vec<Point3<f64>>, Vec<u8>) {
+fn points_in_camera(keyframe: &Keyframe, depth: &DepthMap) -> (Vec<Vector3<f64>>, Vec<u8>) {
     let [width, height] = depth.size_px;
     let n_px = n_pixels(depth.size_px);
     let stride = (1..).find(|stride: &usize| n_px / (stride * stride) <= MAX_POINTS).unwrap_or(1);
@@ -48,7 +42,7 @@ fn points_in_camera(keyframe: &Keyframe, depth: &DepthMap) -> (Vec<Point3<f64>>,
             }
             let point = camera_from_depth * Point3::from(depth.point(x, y, z_m));
             let Some(color) = color_at(keyframe, &point) else { continue };
-            points.push(point);
+            points.push(point.coords);
             colors.extend(color);
         }
     }

@@ -36,6 +36,7 @@ mod negotiation;
 mod page;
 mod picture;
 mod pose;
+mod positions;
 mod protocol;
 mod queue;
 mod range_scan;

@@ -1,5 +1,6 @@
 //! Scans of range scanners, for viewers.
 
+use crate::positions::pack_positions;
 use crate::server_message::{BinaryHeader, RangeScanHeader, frame};
 use keyframe::RangePoints;
 use kinematics::Transform;
@@ -25,14 +26,7 @@ pub(crate) fn pack_range_scan(range_scan: &RangeScan) -> Option<Vec<u8>> {
     let stride = scan.points_in_world_m.len().div_ceil(MAX_POINTS).max(1);
     let from_origin = |point: &[f32; 3]| map_from_odom * Point3::from(*point).cast::<f64>() - origin;
     let points: Vec<Vector3<f64>> = scan.points_in_world_m.iter().step_by(stride).map(from_origin).collect();
-    let extent_m = points.iter().flat_map(|point| point.iter()).fold(0.0_f64, |max, value| max.max(value.abs()));
-    if extent_m <= 0.0 || !extent_m.is_finite() {
-        return None;
-    }
-    let meters_per_count = extent_m / f64::from(i16::MAX);
-    #[expect(clippy::cast_possible_truncation, reason = "the largest coordinate is i16::MAX counts")]
-    let count = |value: &f64| ((value / meters_per_count).round() as i16).to_le_bytes();
-    let positions: Vec<u8> = points.iter().flat_map(|point| point.iter().flat_map(count)).collect();
+    let (positions, meters_per_count) = pack_positions(&points)?;
     let header = RangeScanHeader {
         scanner: &scan.scanner,
         stamp_nanos: scan.stamp.0,

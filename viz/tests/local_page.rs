@@ -6,7 +6,7 @@
 mod browser;
 mod models;
 
-use browser::{Browser, canvas_shot, chromium, wait_for};
+use browser::{Browser, browser_for_page, canvas_shot, wait_for};
 use kinematics::Transform;
 use models::{ModelThread, splat_model, tsdf_model, wall};
 use nalgebra::{Point3, UnitQuaternion, Vector3};
@@ -67,11 +67,7 @@ fn check_local(browser: &mut Browser, thread: &ModelThread, model: &mut dyn Meth
 
 #[test]
 fn local_drawing_equals_the_pictures_of_the_server() {
-    let bundle = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("web/dist/app.js");
-    let Some(program) = chromium().filter(|_| bundle.is_file()) else {
-        eprintln!("page test skipped: it needs Chromium and the bundled page (make web)");
-        return;
-    };
+    let Some(program) = browser_for_page() else { return };
     let hub = Hub::new();
     // Upright, and not along an axis.
     let eye = Point3::new(0.5, -2.9, 0.6);

@@ -5,7 +5,7 @@
 #[expect(dead_code, reason = "the tests of the view use all of it")]
 mod browser;
 
-use browser::{Browser, chromium, wait_for};
+use browser::{Browser, browser_for_page, wait_for};
 use serde_json::{Value, json};
 use std::io::{Read, Write};
 use std::net::{TcpListener, TcpStream};
@@ -62,11 +62,7 @@ fn hello(protocol: u32) -> Value {
 
 #[test]
 fn page_works_with_an_older_server_or_says_why_not() {
-    let bundle = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("web/dist/app.js");
-    let Some(program) = chromium().filter(|_| bundle.is_file()) else {
-        eprintln!("page test skipped: it needs Chromium and the bundled page (make web)");
-        return;
-    };
+    let Some(program) = browser_for_page() else { return };
     let profile = PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join(format!("older-{}", std::process::id()));
     let mut browser = Browser::open(&program, &profile, &serve(vec![hello(2)]), WINDOW_PX);
     wait_for(&mut browser, "the reason", |browser| {

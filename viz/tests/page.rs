@@ -8,7 +8,7 @@ mod browser;
 mod proxy;
 
 use analytic_scene::{draw, looking_along_y};
-use browser::{Browser, canvas_bounds, canvas_shot, chromium, wait_for};
+use browser::{Browser, browser_for_page, canvas_bounds, canvas_shot, wait_for};
 use kinematics::{Stamp, Transform};
 use nalgebra::{Point3, Translation3, UnitQuaternion, Vector3};
 use proxy::{Link, Proxy};
@@ -187,11 +187,7 @@ fn publish_updates(hub: &Hub) {
 
 #[test]
 fn page_renders_scene_and_overlays_correctly() {
-    let bundle = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("web/dist/app.js");
-    let Some(program) = chromium().filter(|_| bundle.is_file()) else {
-        eprintln!("page test skipped: it needs Chromium and the bundled page (make web)");
-        return;
-    };
+    let Some(program) = browser_for_page() else { return };
     let hub = Hub::new();
     publish_updates(&hub);
     let server = Server::start(ServerConfig { listen: ([127, 0, 0, 1], 0).into() }, hub.clone()).expect("a free port");
@@ -457,11 +453,7 @@ fn check_reconnect(browser: &mut Browser, server: Server, hub: &Hub) {
 /// Runs the page through a proxy that interrupts the connection, like a wireless link, up to the end of the run.
 #[test]
 fn page_shows_connection_loss_and_run_result() {
-    let bundle = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("web/dist/app.js");
-    let Some(program) = chromium().filter(|_| bundle.is_file()) else {
-        eprintln!("page test skipped: it needs Chromium and the bundled page (make web)");
-        return;
-    };
+    let Some(program) = browser_for_page() else { return };
     let hub = Hub::new();
     publish_updates(&hub);
     let server = Server::start(ServerConfig { listen: ([127, 0, 0, 1], 0).into() }, hub.clone()).expect("a free port");

@@ -9,7 +9,7 @@ mod browser;
 #[expect(dead_code, reason = "other tests compare the robot with ray casting")]
 mod robot;
 
-use browser::{Browser, chromium, wait_for};
+use browser::{Browser, browser_for_page, wait_for};
 use kinematics::{Stamp, Transform};
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -115,11 +115,7 @@ fn deliver(hub: &Hub, is_over: &AtomicBool) {
 
 #[test]
 fn tasks_of_the_main_thread_are_short() {
-    let bundle = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("web/dist/app.js");
-    let Some(program) = chromium().filter(|_| bundle.is_file()) else {
-        eprintln!("page test skipped: it needs Chromium and the bundled page (make web)");
-        return;
-    };
+    let Some(program) = browser_for_page() else { return };
     let hub = Hub::new();
     hub.set_robot(robot::description());
     hub.set_scene_hint(SceneHint {

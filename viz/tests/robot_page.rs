@@ -9,7 +9,7 @@ mod browser;
 mod robot;
 
 use analytic_scene::{draw, looking_along_y, ray_in_world};
-use browser::{Browser, canvas_bounds, canvas_shot, chromium, wait_for};
+use browser::{Browser, browser_for_page, canvas_bounds, canvas_shot, wait_for};
 use kinematics::Chain;
 use nalgebra::{Point3, Translation3, Vector3};
 use std::path::PathBuf;
@@ -129,11 +129,7 @@ fn iou(request: &RenderRequest, a: &[bool], b: &[bool]) -> f64 {
 
 #[test]
 fn robot_silhouette_is_exact_in_front_and_behind() {
-    let bundle = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("web/dist/app.js");
-    let Some(program) = chromium().filter(|_| bundle.is_file()) else {
-        eprintln!("page test skipped: it needs Chromium and the bundled page (make web)");
-        return;
-    };
+    let Some(program) = browser_for_page() else { return };
     let hub = Hub::new();
     hub.set_scene_hint(SceneHint {
         center_m: [0.0, 0.0, 0.2],

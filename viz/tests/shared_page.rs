@@ -5,7 +5,7 @@
 #[expect(dead_code, reason = "the tests of the view use all of it")]
 mod browser;
 
-use browser::{Browser, chromium, wait_for};
+use browser::{Browser, browser_for_page, wait_for};
 use serde_json::json;
 use std::io::{Read, Write};
 use std::net::TcpListener;
@@ -20,11 +20,7 @@ const BLOCKED_AFTER: Duration = Duration::from_secs(5);
 
 /// Chromium and an empty folder for its profile, if the test can run.
 fn chromium_and_profile(name: &str) -> Option<(PathBuf, PathBuf)> {
-    let bundle = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("web/dist/app.js");
-    let Some(program) = chromium().filter(|_| bundle.is_file()) else {
-        eprintln!("page test skipped: it needs Chromium and the bundled page (make web)");
-        return None;
-    };
+    let program = browser_for_page()?;
     Some((program, PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join(format!("{name}-{}", std::process::id()))))
 }
 

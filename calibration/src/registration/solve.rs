@@ -90,25 +90,18 @@ impl Solution {
         &inverse * meat * &inverse * (n_active / (n_active - 1.0).max(1.0))
     }
 
-    /// Adds an error that the scatter of the pairs does not contain to the covariance. Its size is known, in standard
-    /// deviations, but its direction only roughly: the covariance grows along `error`, and in proportion by as much, spread
+    /// Adds an error of the parameters that the scatter of the pairs does not contain to the covariance. Its size, in units
+    /// of the scales, is known better than its direction: half of its variance is along `error`, and half is spread evenly
     /// over all observable directions.
     pub(super) fn add_error(&mut self, error: &DVector<f64>) {
         let scaled = error.component_div(&self.scales);
-        let squared = self.squared_sigmas(&scaled);
-        let n_observable = self.is_observable.iter().filter(|observable| **observable).count();
-        self.covariance *= 1.0 + squared / n_observable.max(1) as f64;
-        self.covariance.ger(1.0, &scaled, &scaled, 1.0);
-    }
-
-    /// Squared length of a change in standard deviations. Directions without variance do not count.
-    fn squared_sigmas(&self, scaled: &DVector<f64>) -> f64 {
-        const ROUNDING: f64 = 1e-12;
-        let eigen = SymmetricEigen::new(self.covariance.clone());
-        let min = ROUNDING * eigen.eigenvalues.amax();
-        let along = eigen.eigenvectors.tr_mul(scaled);
-        let parts = along.iter().zip(eigen.eigenvalues.iter()).filter(|(_, variance)| **variance > min);
-        parts.map(|(along, variance)| along * along / variance).sum()
+        self.covariance.ger(0.5, &scaled, &scaled, 1.0);
+        let observable = || (0..scaled.len()).filter(|ix| self.is_observable[*ix]);
+        let variance = scaled.norm_squared() / observable().count().max(1) as f64;
+        for ix in observable() {
+            let direction = self.eigen.eigenvectors.column(ix);
+            self.covariance.ger(0.5 * variance, &direction, &direction, 1.0);
+        }
     }
 
     /// Inverse of the information matrix over the observable directions, in scaled units.

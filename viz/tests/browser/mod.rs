@@ -19,8 +19,18 @@ pub(crate) struct Browser {
     n_calls: u64,
 }
 
+/// Path of a browser for tests of the page; `None`, with a message, if Chromium or the bundled page is missing.
+pub(crate) fn browser_for_page() -> Option<PathBuf> {
+    let bundle = Path::new(env!("CARGO_MANIFEST_DIR")).join("web/dist/app.js");
+    let browser = chromium().filter(|_| bundle.is_file());
+    if browser.is_none() {
+        eprintln!("page test skipped: it needs Chromium and the bundled page (make web)");
+    }
+    browser
+}
+
 /// Path of Chromium, if it is installed.
-pub(crate) fn chromium() -> Option<PathBuf> {
+fn chromium() -> Option<PathBuf> {
     let names = ["chromium", "chromium-browser", "google-chrome"];
     let folders: Vec<PathBuf> = std::env::split_paths(&std::env::var_os("PATH")?).collect();
     let paths = names.iter().flat_map(|name| folders.iter().map(move |folder| folder.join(name)));

@@ -19,6 +19,7 @@ export class Overlays {
   private readonly keyframes: THREE.LineSegments;
   private readonly live = new Map<string, THREE.LineSegments>();
   private frustumDepth = 0.06;
+  private posed: (PosedCamera | NumberedKeyframe)[] = [];
 
   constructor(private readonly occlusion: Occlusion) {
     this.keyframes = this.lines(0xffffff, 0.45);
@@ -35,6 +36,7 @@ export class Overlays {
 
   set showsKeyframes(visible: boolean) {
     this.keyframes.visible = visible;
+    this.drawKeyframes();
   }
 
   /** Creates grid and axes for a scene of this size. */
@@ -57,6 +59,14 @@ export class Overlays {
 
   /** Draws the frustums of keyframes, colored by age relative to the newest one. */
   setKeyframes(keyframes: (PosedCamera | NumberedKeyframe)[]): void {
+    this.posed = keyframes;
+    this.drawKeyframes();
+  }
+
+  /** Builds the frustums if they are visible: the list changes several times per second. */
+  private drawKeyframes(): void {
+    if (!this.keyframes.visible) return;
+    const keyframes = this.posed;
     const frustums = keyframes.map((keyframe) => frustum(keyframe, this.frustumDepth));
     setLines(this.keyframes, frustums.flat());
     const secs = keyframes.map((keyframe) => ("stamp_nanos" in keyframe ? keyframe.stamp_nanos * 1e-9 : 0));

@@ -82,7 +82,7 @@ fn divide<T>(
     last: &BTreeMap<Cell, T>,
     leaves: &mut Vec<(Cell, Range<usize>)>,
 ) {
-    // The cells of the last version do not overlap, so the first one here tells whether this cell was divided.
+    // The cells of the last version do not overlap, so the first one here shows whether this cell was divided.
     let first_last = last.range(cell..Cell { first: cell.end(), level: 0 }).next().map(|(last, _)| *last);
     let max_splats = match first_last {
         Some(last) if last == cell => MAX_SPLATS_KEPT,
