@@ -367,6 +367,22 @@ fn request_picture_of_each_method(url: &str) {
     for method in ["splat", "tsdf"] {
         receive_model(&mut socket, method);
     }
+    receive_observations(&mut socket);
+}
+
+/// Receives the map of when and how precisely the scene was observed.
+fn receive_observations(socket: &mut tungstenite::WebSocket<std::net::TcpStream>) {
+    let message = serde_json::json!({"type": "subscribe", "topic": "observations", "rate_hz": 1});
+    socket.send(tungstenite::Message::text(message.to_string())).expect("sent");
+    let header: Value = loop {
+        let tungstenite::Message::Binary(bytes) = socket.read().expect("a map") else { continue };
+        let n_header = u32::from_le_bytes(bytes[..4].try_into().expect("4 bytes")) as usize;
+        let header: Value = serde_json::from_slice(&bytes[4..4 + n_header]).expect("JSON");
+        if header["type"] == "observations" {
+            break header;
+        }
+    };
+    assert!(header["n_views"].as_u64().is_some_and(|n| n >= 2) && header["newest_millis"].is_number(), "{header}");
 }
 
 /// Receives all chunks of a model in training.

@@ -150,6 +150,29 @@ fn chunks(client: &mut Client, method: &str) -> Vec<Value> {
     }
 }
 
+/// Checks the map of observations, for which depth is rendered from all cameras.
+fn check_observations(client: &mut Client) {
+    let message = json!({"type": "subscribe", "topic": "observations", "rate_hz": 10});
+    client.socket.send(Message::text(message.to_string())).expect("sent");
+    let (header, payload) = loop {
+        let (header, payload) = client.receive();
+        if header["type"] == "observations" && header["n_views"] == 10 {
+            break (header, payload);
+        }
+    };
+    assert!(header["newest_millis"].is_null() && header["cell_m"].as_f64().is_some_and(|cell| cell > 0.0), "{header}");
+    let mut codes = Vec::new();
+    flate2::read::ZlibDecoder::new(&payload[..]).read_to_end(&mut codes).expect("a zlib stream");
+    let n_cells: u64 = (0..3).map(|axis| header["n_cells"][axis].as_u64().expect("a number")).product();
+    assert_eq!(codes.len() as u64, 2 * n_cells);
+    let (ages, sigmas) = codes.split_at(codes.len() / 2);
+    let n_observed = ages.iter().filter(|age| **age > 0).count();
+    assert!(n_observed > 100 && n_observed < ages.len(), "{n_observed} of {}", ages.len());
+    // The cameras look at the wall from different directions, so most positions are determined without measured depth.
+    let n_determined = sigmas.iter().filter(|sigma| (1..255).contains(*sigma)).count();
+    assert!(2 * n_determined > n_observed, "{n_determined} of {n_observed}");
+}
+
 fn sum_of(chunks: &[Value], field: &str) -> u64 {
     chunks.iter().map(|chunk| chunk[field].as_u64().expect("a number")).sum()
 }
@@ -225,6 +248,7 @@ fn view_matches_render() {
     let n_all = status["primitives"].as_u64().expect("a number");
     assert!(n_splats <= n_all && 2 * n_splats > n_all, "{n_splats} of {n_all} splats are visible");
     assert!(sum_of(&chunks(&mut client, "tsdf"), "n_triangles") > 1000);
+    check_observations(&mut client);
     let refused = client.request_picture(&start, Some("mesh")).expect_err("no such model");
     assert!(refused.contains("\"mesh\"") && refused.contains("splat or tsdf or nerf"), "{refused}");
     assert_eq!(view.interrupt().code(), Some(0));

@@ -40,6 +40,7 @@ mod ledger;
 mod live;
 pub mod methods;
 pub mod next_commands;
+mod observations;
 mod observer;
 pub mod partial;
 mod pending_evaluation;

@@ -2,6 +2,7 @@
 
 use crate::chunk_publisher::ChunkPublisher;
 use crate::ledger::{KeyframeTimes, Ledger};
+use crate::observations::{ObservationPublisher, SeenFrom};
 use crate::recoveries::{self, OpenGpu, Recoveries};
 use crate::render_budget::RenderBudget;
 use crate::session::Session;
@@ -11,7 +12,7 @@ use capture::{Change, Feed, FeedItem, InputResult, Notes};
 use keyframe::{Keyframe, Split};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
-use trainer::{AlignTiming, QueuedPicture};
+use trainer::{AlignTiming, QueuedPicture, RenderRequest};
 use viz::{Control, Hub, KeyframePose, ModelStatus, PendingRender, Status};
 
 /// Minimum number of keyframes that determine the first view of the scene.
@@ -81,6 +82,7 @@ pub struct Live {
     /// Result of the last checkpoint that an operator requested.
     checkpoint_note: Option<String>,
     chunk_publisher: ChunkPublisher,
+    observation_publisher: ObservationPublisher,
 }
 
 /// Changes a keyframe before the models receive it.
@@ -95,6 +97,7 @@ impl Live {
             sessions,
             feed,
             chunk_publisher: ChunkPublisher::new(hub.clone()),
+            observation_publisher: ObservationPublisher::new(hub.clone()),
             hub,
             pace: options.pace,
             start_keyframes: options.start_keyframes,
@@ -217,6 +220,7 @@ impl Live {
             .and_then(|()| self.step())
             .and_then(|()| self.render())
             .map(|()| self.publish_chunks())
+            .map(|()| self.publish_observations())
             .and_then(|()| self.publish());
         advanced.or_else(|error| self.recoveries.recover(&mut self.sessions, error))
     }
@@ -469,6 +473,26 @@ impl Live {
                 self.budget.add_render(session.publish_chunks(&mut self.chunk_publisher));
             }
         }
+    }
+
+    /// Publishes when and how precisely each part of the scene was observed. Depth of cameras without depth is rendered with
+    /// the first model.
+    fn publish_observations(&mut self) {
+        let can_render = self.is_training() && !self.is_scoring() && self.budget.may_render();
+        if !can_render || !self.observation_publisher.is_due() {
+            return;
+        }
+        let session = &mut self.sessions[0];
+        let seen_from = |keyframe: &Arc<Keyframe>| SeenFrom {
+            pose: frustum(keyframe, &session.camera_of(keyframe)),
+            keyframe: Some(Arc::clone(keyframe)),
+        };
+        let views: Vec<SeenFrom> = self.keyframes.iter().map(seen_from).collect();
+        let newest = self.ledger.keyframes().last().map(|times| times.input.captured.unwrap_or(times.input.arrived));
+        let step = session.progress().step;
+        let render = |request: &RenderRequest| session.render(request);
+        let spent = self.observation_publisher.publish(&views, step, newest, render);
+        self.budget.add_render(spent);
     }
 
     /// Publishes the status of the run to viewers, a few times per second.

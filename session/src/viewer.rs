@@ -1,11 +1,12 @@
 //! Draws trained models for viewers: the loop of `view`, and of a run after its training.
 
 use crate::chunk_publisher::ChunkPublisher;
+use crate::observations::{ObservationPublisher, SeenFrom};
 use capture::Stop;
 use kinematics::Transform;
 use std::time::Duration;
 use trainer::{Aabb, Method, ModelKind, RenderRequest, Rendered};
-use viz::{Hub, PendingRender};
+use viz::{Hub, KeyframePose, PendingRender};
 
 /// Maximum response time to Ctrl-C while no client requests a picture.
 const POLL_PERIOD: Duration = Duration::from_millis(100);
@@ -24,15 +25,25 @@ pub struct ModelViewer {
     models: Vec<ServedModel>,
     hub: Hub,
     chunk_publisher: ChunkPublisher,
+    /// Views of the training images, in the page's world.
+    cameras: Vec<SeenFrom>,
+    observation_publisher: ObservationPublisher,
     /// Pose of the page's world, which is z up, in the model's world.
     model_from_page: Transform,
 }
 
 impl ModelViewer {
-    /// A viewer of models whose z axis points up.
+    /// A viewer of models whose z axis points up. The keyframes of the hub are the views of the model's training images.
     pub fn new(models: Vec<ServedModel>, hub: Hub) -> Self {
-        let chunk_publisher = ChunkPublisher::new(hub.clone());
-        Self { models, hub, chunk_publisher, model_from_page: Transform::identity() }
+        let seen_from = |pose: KeyframePose| SeenFrom { pose, keyframe: None };
+        Self {
+            models,
+            chunk_publisher: ChunkPublisher::new(hub.clone()),
+            cameras: hub.keyframe_poses().into_iter().map(seen_from).collect(),
+            observation_publisher: ObservationPublisher::new(hub.clone()),
+            hub,
+            model_from_page: Transform::identity(),
+        }
     }
 
     /// Rotates the models so that they are upright in the page's world, which is z up.
@@ -50,7 +61,19 @@ impl ModelViewer {
                 self.answer(pending);
             }
             self.publish_chunks();
+            self.publish_observations();
         }
+    }
+
+    fn publish_observations(&mut self) {
+        if self.cameras.is_empty() || !self.observation_publisher.is_due() {
+            return;
+        }
+        let method = &mut self.models[0].method;
+        let model_from_page = &self.model_from_page;
+        let render = |request: &RenderRequest| method.render(&in_model(request, model_from_page));
+        // The step has no effect, because the model does not change.
+        self.observation_publisher.publish(&self.cameras, 1, None, render);
     }
 
     fn publish_chunks(&mut self) {

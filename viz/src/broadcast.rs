@@ -45,6 +45,8 @@ pub(crate) struct LatestMessages {
     pub(crate) base_path: Option<Item>,
     /// Scans by scanner, if a client shows them.
     pub(crate) range_scans: BTreeMap<Arc<str>, Item>,
+    /// The map of observations, if a client shows it.
+    pub(crate) observations: Option<Item>,
     /// Points of keyframes by number, if a client draws them; `None` for keyframes without points.
     pub(crate) keyframe_points: BTreeMap<u64, Option<Message>>,
     /// Chunks of the models that clients draw.
@@ -71,6 +73,7 @@ impl LatestMessages {
             && self.live_images.is_empty()
             && self.base_path.is_none()
             && self.range_scans.is_empty()
+            && self.observations.is_none()
             && self.keyframe_points.is_empty()
             && self.model_chunks.is_empty()
     }
@@ -95,13 +98,14 @@ pub(crate) async fn broadcast(hub: Hub, clock: ServerClock, latest_messages_send
     let (mut scene, mut status, mut robot, mut keyframes, live_images) =
         (hub.scene(), hub.status(), hub.robot(), hub.keyframes(), hub.live_images());
     let (mut base_path, mut range_scans) = (hub.base_path(), hub.range_scans());
-    let mut model_chunks = hub.model_chunks();
+    let (mut observations, mut model_chunks) = (hub.observations(), hub.model_chunks());
     // A client may connect before the first check, and it has not received what was set earlier.
     scene.mark_changed();
     status.mark_changed();
     robot.mark_changed();
     base_path.mark_changed();
     range_scans.mark_changed();
+    observations.mark_changed();
     keyframes.mark_changed();
     let mut status_sent = Throttle::new(STATUS_PERIOD);
     let mut base_path_sent = Throttle::new(BASE_PATH_PERIOD);
@@ -171,6 +175,7 @@ pub(crate) async fn broadcast(hub: Hub, clock: ServerClock, latest_messages_send
             robot.mark_changed();
             base_path.mark_changed();
             range_scans.mark_changed();
+            observations.mark_changed();
             keyframes.mark_changed();
             is_list_outdated = true;
             image_encodings.retain(|_, image_encoding| image_encoding.is_running);
@@ -228,6 +233,13 @@ pub(crate) async fn broadcast(hub: Hub, clock: ServerClock, latest_messages_send
                     latest_messages.range_scans.insert(Arc::clone(&scanner), Item { number, message: message.clone() });
                 });
             }
+        }
+        let needs_observations = demands.iter().any(|demand| demand.subscriptions.observations.is_some());
+        if needs_observations && let Some(packed) = take_if_changed(&mut observations).flatten() {
+            let message = Message::binary(packed.message(clock));
+            publish_item(&|latest_messages, number| {
+                latest_messages.observations = Some(Item { number, message: message.clone() });
+            });
         }
         if keyframes_sent.is_due()
             && let Some(list) = take_if_changed(&mut keyframes)

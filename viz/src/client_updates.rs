@@ -24,6 +24,7 @@ pub(crate) struct ClientUpdates {
     live_images: BTreeMap<Arc<str>, Sent>,
     base_path: Sent,
     range_scans: BTreeMap<Arc<str>, Sent>,
+    observations: Sent,
     /// Whether the last long message was a live image.
     was_image: bool,
     /// Numbers of the keyframes whose points were sent, and the time of the last ones.
@@ -39,6 +40,18 @@ pub(crate) struct ClientUpdates {
 struct Sent {
     number: u64,
     at: Option<Instant>,
+}
+
+impl Sent {
+    /// The message of a newer item if the client has subscribed to this kind and its period is over.
+    fn next(&mut self, (period, latest): (Option<Duration>, &Option<Item>), timer: &mut Timer) -> Option<Message> {
+        let item = latest.as_ref().filter(|item| item.number > self.number)?;
+        if !timer.is_due(self.at, period?) {
+            return None;
+        }
+        *self = Self { number: item.number, at: Some(timer.now) };
+        Some(item.message.clone())
+    }
 }
 
 /// What to do next.
@@ -108,6 +121,10 @@ impl ClientUpdates {
                     return Next::Long(message);
                 }
             }
+            let observations = (subscriptions.observations, &latest.observations);
+            if let Some(message) = self.observations.next(observations, &mut timer) {
+                return Next::Long(message);
+            }
             if let Some(message) = self.next_chunk(latest, subscriptions, &mut timer) {
                 return Next::Long(message);
             }
@@ -129,19 +146,11 @@ impl ClientUpdates {
         if let Some(scene) = newer(latest.scene.as_ref(), &mut self.scene) {
             return Some(scene);
         }
-        if let (Some(period), Some(item)) = (subscriptions.status, &latest.status)
-            && item.number > self.status.number
-            && timer.is_due(self.status.at, period)
-        {
-            self.status = Sent { number: item.number, at: Some(timer.now) };
-            return Some(item.message.clone());
+        if let Some(status) = self.status.next((subscriptions.status, &latest.status), timer) {
+            return Some(status);
         }
-        if let (Some(period), Some(item)) = (subscriptions.base_path, &latest.base_path)
-            && item.number > self.base_path.number
-            && timer.is_due(self.base_path.at, period)
-        {
-            self.base_path = Sent { number: item.number, at: Some(timer.now) };
-            return Some(item.message.clone());
+        if let Some(path) = self.base_path.next((subscriptions.base_path, &latest.base_path), timer) {
+            return Some(path);
         }
         subscriptions.robot_state.and_then(|_| newer(latest.robot.as_ref(), &mut self.robot))
     }
@@ -202,12 +211,7 @@ impl ClientUpdates {
         subscriptions: &Subscriptions,
         timer: &mut Timer,
     ) -> Option<Message> {
-        let item = latest.keyframe_list.as_ref().filter(|item| item.number > self.keyframe_list.number)?;
-        if !timer.is_due(self.keyframe_list.at, subscriptions.keyframes?) {
-            return None;
-        }
-        self.keyframe_list = Sent { number: item.number, at: Some(timer.now) };
-        Some(item.message.clone())
+        self.keyframe_list.next((subscriptions.keyframes, &latest.keyframe_list), timer)
     }
 
     /// Changes of the list of keyframes.

@@ -2,6 +2,7 @@
 
 use crate::base_path::BasePath;
 use crate::chunk_list::ChunkList;
+use crate::observation_map::{ObservationMap, PackedObservations};
 use crate::picture::packing;
 use crate::pose::row_major;
 use crate::protocol::{Control, ProjectionMessage};
@@ -89,6 +90,7 @@ struct Shared {
     /// When the path was extended last.
     path_extended: Mutex<Option<Instant>>,
     range_scans: watch::Sender<RangeScans>,
+    observations: watch::Sender<Option<Arc<PackedObservations>>>,
     /// Requirements of the connected clients.
     demands: Mutex<BTreeMap<u64, Demand>>,
     /// For each camera: transform `reported_from_corrected`.
@@ -159,6 +161,11 @@ impl Hub {
     /// Replaces the keyframe frustums. Call this when the keyframes have changed.
     pub fn set_keyframes(&self, keyframes: Vec<KeyframePose>) {
         self.shared.keyframes.send_replace(keyframes.into());
+    }
+
+    /// The keyframe frustums.
+    pub fn keyframe_poses(&self) -> Vec<KeyframePose> {
+        self.shared.keyframes.borrow().to_vec()
     }
 
     /// The minimum time between two calls of [`Self::set_model_chunks`] for a model; `None` if no client draws it.
@@ -243,6 +250,19 @@ impl Hub {
         self.shared.range_scans.send_modify(|scans| {
             scans.insert(Arc::clone(&range_scan.scan.scanner), Arc::new(range_scan));
         });
+    }
+
+    /// Whether a client shows when and how precisely the scene was observed.
+    pub fn needs_observations(&self) -> bool {
+        self.shared.demands.lock().values().any(|demand| demand.subscriptions.observations.is_some())
+    }
+
+    /// Sets the map of observations. Compresses it, which takes some milliseconds.
+    pub fn set_observations(&self, map: &ObservationMap) {
+        match PackedObservations::new(map) {
+            Ok(packed) => _ = self.shared.observations.send_replace(Some(Arc::new(packed))),
+            Err(error) => log::error!("cannot compress the map of observations: {error}"),
+        }
     }
 
     /// Sets the keyframes of which clients can draw points. They are not kept alive.
@@ -363,6 +383,10 @@ impl Hub {
 
     pub(crate) fn range_scans(&self) -> watch::Receiver<RangeScans> {
         self.shared.range_scans.subscribe()
+    }
+
+    pub(crate) fn observations(&self) -> watch::Receiver<Option<Arc<PackedObservations>>> {
+        self.shared.observations.subscribe()
     }
 
     pub(crate) fn model_chunks(&self) -> watch::Receiver<ModelLists> {

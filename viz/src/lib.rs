@@ -33,6 +33,7 @@ mod link_rate;
 #[cfg(any(test, fuzzing))]
 mod message_checks;
 mod negotiation;
+mod observation_map;
 mod page;
 mod picture;
 mod pose;
@@ -57,6 +58,7 @@ pub use error::Error;
 #[cfg(feature = "foxglove")]
 pub use foxglove_server::FoxgloveServer;
 pub use hub::{Hub, PendingRender};
+pub use observation_map::{ObservationMap, ObservedCell};
 pub use protocol::{BASE_PROTOCOL_VERSION, Control, PROTOCOL_VERSION};
 pub use range_scan::RangeScan;
 pub use robot::{MeshFormat, RobotDescription, RobotMesh, RobotState};

@@ -79,6 +79,8 @@ pub(crate) enum Topic {
     BasePath,
     /// Chunks of a model, for clients that draw it themselves.
     ModelChunks,
+    /// When and how precisely each part of the scene was observed.
+    Observations,
 }
 
 /// Fields of `subscribe`.

@@ -118,6 +118,8 @@ pub(crate) enum BinaryHeader<'a> {
     KeyframePoints(PointsHeader),
     /// A scan of a range scanner.
     RangeScan(RangeScanHeader<'a>),
+    /// When and how precisely each part of the scene was observed.
+    Observations(ObservationsHeader),
     /// A chunk of a model.
     ModelChunk(&'a ChunkHeader<'a>),
     /// A part of a binary message.
@@ -140,6 +142,19 @@ pub(crate) struct RangeScanHeader<'a> {
     pub(crate) origin_m: [f64; 3],
     pub(crate) n_points: usize,
     pub(crate) meters_per_count: f64,
+}
+
+/// Header of `observations`.
+#[derive(Clone, Copy, Debug, Serialize)]
+pub(crate) struct ObservationsHeader {
+    pub(crate) min_m: [f64; 3],
+    pub(crate) cell_m: f64,
+    pub(crate) n_cells: [u32; 3],
+    pub(crate) n_views: usize,
+    pub(crate) newest_millis: Option<f64>,
+    pub(crate) min_age_secs: f64,
+    pub(crate) min_sigma_m: f64,
+    pub(crate) log_step: f64,
 }
 
 /// Header of `model_chunk`.

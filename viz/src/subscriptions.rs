@@ -40,6 +40,8 @@ pub(crate) struct Subscriptions {
     pub(crate) range_scans: Option<Duration>,
     /// The same for the path of the base.
     pub(crate) base_path: Option<Duration>,
+    /// The same for the map of observations.
+    pub(crate) observations: Option<Duration>,
     /// Chunks of a model; `None` if not sent.
     pub(crate) model_chunks: Option<ChunkSubscription>,
     n_chunk_subscriptions: u64,
@@ -82,6 +84,7 @@ impl Default for Subscriptions {
             n_point_subscriptions: 0,
             range_scans: None,
             base_path: None,
+            observations: None,
             model_chunks: None,
             n_chunk_subscriptions: 0,
             live_images: ImageSubscription { period: Some(Duration::from_millis(190)), max_px: DEFAULT_IMAGE_PX },
@@ -121,6 +124,7 @@ impl Subscriptions {
             }
             Topic::RangeScans => self.range_scans = period,
             Topic::BasePath => self.base_path = period,
+            Topic::Observations => self.observations = period,
             Topic::ModelChunks => self.model_chunks = self.chunk_subscription(period, method, max_bytes_per_sec)?,
             Topic::LiveImages => {
                 let rounded = |size_px: [u32; 2]| size_px.map(|side| side / MIN_IMAGE_PX * MIN_IMAGE_PX);

@@ -243,13 +243,15 @@ mod tests {
 
     #[test]
     fn a_field_of_view_becomes_a_focal_length() {
-        let right_angle = json!({"kind": "pinhole", "vertical_fov_rad": std::f64::consts::FRAC_PI_2});
-        let view_request = message(|value| value["projection"] = right_angle).expect("valid");
-        let Projection::Pinhole { focal_px, principal_px } = view_request.request.projection else {
-            panic!("a pinhole stays one");
-        };
-        assert!((focal_px[0] - 360.0).abs() < 1e-9 && (focal_px[1] - 360.0).abs() < 1e-9);
-        assert_eq!(principal_px, [640.0, 360.0]);
+        for (degrees, expected_px) in [(90.0_f64, 360.0), (45.0, 360.0 / (2.0_f64.sqrt() - 1.0))] {
+            let projection = json!({"kind": "pinhole", "vertical_fov_rad": degrees.to_radians()});
+            let view_request = message(|value| value["projection"] = projection).expect("valid");
+            let Projection::Pinhole { focal_px, principal_px } = view_request.request.projection else {
+                panic!("a pinhole stays one");
+            };
+            assert!(focal_px.iter().all(|focal| (focal - expected_px).abs() < 1e-9), "{focal_px:?}");
+            assert_eq!(principal_px, [640.0, 360.0]);
+        }
     }
 
     #[test]

@@ -14,7 +14,7 @@ use std::path::PathBuf;
 use std::time::{Duration, Instant};
 use trainer::eval::{PixelPair, psnr};
 use trainer::{Method, RenderRequest};
-use viz::{Hub, ModelStatus, SceneHint, Server, ServerConfig, Status};
+use viz::{Hub, ModelStatus, ObservationMap, ObservedCell, SceneHint, Server, ServerConfig, Status};
 
 const WINDOW_PX: [u32; 2] = [1000, 640];
 /// Required PSNR of the page's own drawing against the server's picture, dB.
@@ -65,6 +65,56 @@ fn check_local(browser: &mut Browser, thread: &ModelThread, model: &mut dyn Meth
     }
 }
 
+/// Checks that the model is tinted by its observations, no matter where it is drawn. The left half was just observed, the
+/// right half long ago.
+fn check_tint(browser: &mut Browser, hub: &Hub, name: &str) {
+    browser.click("toggle-age");
+    wait_for(browser, "a subscription", |_| hub.needs_observations());
+    let cell = |ix, age_secs| ObservedCell { ix, age_secs, sigma_m: 0.001 };
+    hub.set_observations(&ObservationMap {
+        min_m: [-10.0; 3],
+        cell_m: 10.0,
+        n_cells: [2; 3],
+        observed: (0..8).map(|ix| cell(ix, if ix % 2 == 0 { 0.0 } else { 1e6 })).collect(),
+        n_views: 2,
+        newest_at: None,
+    });
+    let scratch = PathBuf::from(env!("CARGO_TARGET_TMPDIR"));
+    for is_local in [true, false] {
+        if !is_local {
+            browser.click("toggle-local");
+            wait_for(browser, "a full picture", |browser| browser.text("picture-text").contains("100 %"));
+        }
+        let began = Instant::now();
+        loop {
+            let shot = canvas_shot(browser);
+            // Yellow on the left, purple on the right.
+            let [left, right] = [1, 4].map(|part| mean_color(&shot, part * shot.width() / 6));
+            let is_tinted = left[0] > left[2] + 40.0 && left[1] > left[2] + 40.0 && right[2] > right[1] + 20.0;
+            if is_tinted {
+                break;
+            }
+            if began.elapsed() > TIMEOUT {
+                shot.save(scratch.join(format!("page-tint-{name}.png"))).expect("written");
+                panic!("{name}, drawn locally: {is_local}: {left:?} on the left, {right:?} on the right");
+            }
+        }
+    }
+    browser.click("toggle-local");
+    browser.click("toggle-age");
+    wait_for(browser, "no subscription", |_| !hub.needs_observations());
+}
+
+/// Mean color of a sixth of the middle rows, from column `begin` on.
+fn mean_color(shot: &image::RgbImage, begin: u32) -> [f64; 3] {
+    let columns = begin..begin + shot.width() / 6;
+    let rows = 2 * shot.height() / 5..3 * shot.height() / 5;
+    let pixels: Vec<_> = rows.flat_map(|y| columns.clone().map(move |x| shot.get_pixel(x, y).0)).collect();
+    #[expect(clippy::cast_precision_loss, reason = "a small number")]
+    let n = pixels.len() as f64;
+    [0, 1, 2].map(|channel| pixels.iter().map(|pixel| f64::from(pixel[channel])).sum::<f64>() / n)
+}
+
 #[test]
 fn local_drawing_equals_the_pictures_of_the_server() {
     let Some(program) = browser_for_page() else { return };
@@ -108,11 +158,13 @@ fn local_drawing_equals_the_pictures_of_the_server() {
     });
     check_local(&mut browser, &thread, &mut reference_splats, ("splat-moved", MIN_DB));
     assert_eq!(thread.n_color_requests(), n_color_requests);
+    check_tint(&mut browser, &hub, "splat");
 
     browser.evaluate("document.querySelector('[data-method=tsdf]').click()");
     wait_for(&mut browser, "the other model", |_| hub.chunk_period("tsdf").is_some());
     assert!(hub.chunk_period("splat").is_none() && !hub.has_model_chunks("splat"), "its memory is free");
     check_local(&mut browser, &thread, &mut reference_tsdf, ("tsdf", MIN_DB));
+    check_tint(&mut browser, &hub, "tsdf");
     browser.click("toggle-crop");
     wait_for(&mut browser, "the crop", |_| thread.last_request().crop.is_some());
     // The edges and handles of the box are drawn, too.

@@ -18,8 +18,8 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 use trainer::{ChunkData, ChunkLayout, ModelChunk, ModelChunks};
 use viz::{
-    Control, Error, Hub, KeyframePose, LiveImage, LivePixels, ModelStatus, PendingRender, RangeScan, SceneHint, Server,
-    ServerConfig, Status,
+    Control, Error, Hub, KeyframePose, LiveImage, LivePixels, ModelStatus, ObservationMap, ObservedCell, PendingRender,
+    RangeScan, SceneHint, Server, ServerConfig, Status,
 };
 
 /// Far more than loopback needs. A test that waits this long fails.
@@ -379,6 +379,12 @@ fn one_of_each() -> Vec<Value> {
     client.send_json(&json!({"type": "subscribe", "topic": "range_scans", "rate_hz": 10}));
     hub.set_range_scan(range_scan());
     messages.extend([client.text_of("base_path"), client.binary_of("range_scan").0]);
+    assert!(!hub.needs_observations());
+    client.send_json(&json!({"type": "subscribe", "topic": "observations", "rate_hz": 2}));
+    client.settle();
+    assert!(hub.needs_observations());
+    hub.set_observations(&observation_map());
+    messages.push(client.binary_of("observations").0);
     client.send_json(&json!({"type": "ping", "t": 1.0}));
     messages.push(client.text_of("pong"));
     hub.set_live_image(LiveImage {
@@ -406,6 +412,17 @@ fn one_of_each() -> Vec<Value> {
     drop(server);
     messages.push(client.text_of("goodbye"));
     messages
+}
+
+fn observation_map() -> ObservationMap {
+    ObservationMap {
+        cell_m: 0.5,
+        n_cells: [1, 2, 1],
+        observed: vec![ObservedCell { ix: 1, age_secs: 1.0, sigma_m: 0.002 }],
+        n_views: 3,
+        newest_at: Some(Instant::now()),
+        ..ObservationMap::default()
+    }
 }
 
 fn range_scan() -> RangeScan {
@@ -474,12 +491,12 @@ fn used_port_and_public_address_are_rejected() {
 #[test]
 fn the_page_and_the_status_are_served_over_http() {
     let (hub, server) = start();
-    hub.set_status(Status { model: model_status("splat", 77), ..Status::default() });
+    hub.set_status(Status { model: model_status("splat", 70_000), ..Status::default() });
     let page = get(server.address(), "/", "localhost");
     assert!(page.starts_with("HTTP/1.1 200") && page.contains("fieldrig"), "{page}");
     let status = get(server.address(), "/status", "localhost");
     let body = status.split("\r\n\r\n").nth(1).expect("a body");
-    assert_eq!(serde_json::from_str::<Value>(body).expect("JSON")["step"], json!(77));
+    assert_eq!(serde_json::from_str::<Value>(body).expect("JSON")["step"], json!(70_000), "steps may exceed 16 bits");
     assert!(get(server.address(), "/nothing", "localhost").starts_with("HTTP/1.1 404"));
     assert!(get(server.address(), "/status", "example.com").starts_with("HTTP/1.1 403"));
 }

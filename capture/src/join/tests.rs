@@ -396,6 +396,20 @@ fn every_rejection_reason_is_reachable() {
         assert!(counts.rejected.get(&why).is_some_and(|n| *n >= 3), "{why}: {counts}");
         assert!(counts.to_string().contains(&why.to_string()));
     }
+    let smoothed: fn(Image) -> Image = |image| {
+        let averages = image.data.windows(10).map(|pixels| {
+            let sum: u32 = pixels.iter().step_by(3).map(|level| u32::from(*level)).sum();
+            u8::try_from(sum / 4).expect("the average of four levels")
+        });
+        let data: Vec<u8> = averages.chain([90; 9]).collect();
+        Image { data: data.into(), ..image }
+    };
+    let n_not_sharp = |min_frac: f64| {
+        let counts = counts_with(smoothed, &[Override::new("join.min_sharpness_frac", min_frac)]);
+        counts.rejected.get(&Rejection::NotSharp).copied().unwrap_or_default()
+    };
+    assert_eq!(n_not_sharp(0.0), 0);
+    assert!(n_not_sharp(0.9) >= 3, "a higher threshold rejects more images");
     assert_eq!(
         counts_with(|image| image, &[]).rejected.keys().collect::<Vec<_>>(),
         [&Rejection::NotMoved],

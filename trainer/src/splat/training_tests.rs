@@ -306,6 +306,28 @@ fn late_keyframe_resumes_growth() {
     assert!(n_splats_after(&mut trainer, 120) > planned, "growth continues");
 }
 
+/// The newest image must not wait for the next one.
+#[test]
+fn newest_keyframe_is_trained_on() {
+    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let keyframes = keyframes(&gpu, true);
+    let mut trainer = SplatTrainer::new(gpu, options()).unwrap();
+    trainer.push(keyframes[1].clone()).unwrap();
+    train(&mut trainer, 60);
+    // Only the newest image shows a white scene.
+    let white = vec![255; keyframes[6].rgba_srgb.len()];
+    let newest = Arc::new(Keyframe { rgba_srgb: white.clone().into(), ..keyframes[6].as_ref().clone() });
+    let whiteness_db = |trainer: &mut SplatTrainer| {
+        let picture = trainer.render(&request(newest.world_from_camera)).unwrap();
+        psnr(&PixelPair::new(SIZE_PX, &picture.rgba_srgb, &white).unwrap()).unwrap()
+    };
+    let before_db = whiteness_db(&mut trainer);
+    trainer.push(newest.clone()).unwrap();
+    train(&mut trainer, 60);
+    let after_db = whiteness_db(&mut trainer);
+    assert!(after_db > before_db + 1.5, "{before_db} dB, then {after_db} dB");
+}
+
 /// A trainer on many images with a trial of lens parameters.
 fn trainer_with_lens_trial(keyframes: &[Arc<Keyframe>], gpu: Arc<Gpu>, max_splats: u32) -> SplatTrainer {
     let cameras = CameraRefinement::Try(vec![ParamSet::LENS]);

@@ -4,6 +4,7 @@ import * as THREE from "three";
 import { worldFromCamera } from "./convention";
 import type { Crop } from "./crop_box";
 import { MeshLayer } from "./mesh_layer";
+import type { ObservationLayer } from "./observation_layer";
 import type { ModelChunkHeader, ModelChunksRemoved } from "./protocol";
 import { SplatLayer } from "./splat_layer";
 import type { View } from "./render_scheduler";
@@ -12,7 +13,7 @@ export class LocalModel {
   readonly root = new THREE.Group();
   /** Number of chunks of the model, and of those that are missing or coarse. */
   progress = { nChunks: 0, nIncomplete: 0 };
-  private readonly meshes = new MeshLayer();
+  private readonly meshes: MeshLayer;
   private readonly splats: SplatLayer;
   private readonly worldFromModel = new THREE.Matrix4();
   private drawn: string | null = null;
@@ -21,8 +22,12 @@ export class LocalModel {
   /** Counts the resets; chunks from before are dropped. */
   private generation = 0;
 
-  constructor(private readonly changed: () => void) {
-    this.splats = new SplatLayer(changed);
+  constructor(
+    observations: ObservationLayer,
+    private readonly changed: () => void,
+  ) {
+    this.meshes = new MeshLayer(observations);
+    this.splats = new SplatLayer(observations, changed);
     this.root.add(this.meshes.root, this.splats.mesh);
     this.meshes.root.matrixAutoUpdate = false;
     this.root.visible = false;

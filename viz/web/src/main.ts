@@ -10,6 +10,7 @@ import { KeyframeList } from "./keyframe_list";
 import { LinkReadout } from "./link_readout";
 import { LiveImages } from "./live_images";
 import { ModelSwitch } from "./model_switch";
+import type { Quantity } from "./observation_layer";
 import { BACKGROUND, OrbitView } from "./orbit_view";
 import { panels } from "./panels";
 import type { BinaryHeader, LiveImageHeader, ModelStatus, PictureHeader, Status, TextMessage } from "./protocol";
@@ -25,10 +26,19 @@ let latestStatus: Status | null = null;
 let latestStep = -1;
 let showsModel = true;
 let liveCamera: LiveImageHeader | null = null;
+/** Buttons that tint the model, their keys, and what the tint shows. */
+const TINTS: readonly { id: string; key: string; quantity: Quantity }[] = [
+  { id: "toggle-age", key: "a", quantity: "age" },
+  { id: "toggle-uncertainty", key: "y", quantity: "uncertainty" },
+];
 
 const readouts = new Readouts();
 const banner = new Banner();
-const view = new OrbitView(element("canvas", HTMLCanvasElement), () => scheduler.moved());
+const view = new OrbitView(
+  element("canvas", HTMLCanvasElement),
+  () => scheduler.moved(),
+  () => connection.clock,
+);
 keepToken();
 window.addEventListener("hashchange", () => {
   if (keepToken()) location.reload(); // The server assigns the role when the page connects.
@@ -57,8 +67,10 @@ const connection = new Connection(`${location.protocol === "https:" ? "wss" : "w
       view.scans.clear();
       view.scans.setPath([]);
       view.local.clear();
+      view.observations.clear();
       subscriptions.restart();
       element("toggle-points").hidden = !connection.supports("keyframe_points");
+      for (const { id } of TINTS) element(id).hidden = !connection.supports("observations");
     }
     if (shown.dataset.state !== before) view.changed();
   },
@@ -167,6 +179,8 @@ function receiveBinary(header: BinaryHeader, payload: Uint8Array<ArrayBuffer>): 
     view.scans.show(header, payload);
     element("toggle-scans").hidden = false;
     view.changed();
+  } else if (header.type === "observations") {
+    view.observations.receive(header, payload).catch((error: unknown) => console.error("cannot show ages:", error));
   } else if (header.type === "model_chunk") {
     view.local.receive(header, payload);
     showLocalProgress();
@@ -266,6 +280,14 @@ toggle("toggle-scans", "s", (isOn) => {
   view.scans.enabled = isOn;
   subscriptions.scans = isOn;
 });
+for (const { id, key, quantity } of TINTS) {
+  toggle(id, key, (isOn) => {
+    // At most one of them is on.
+    for (const other of TINTS) if (other.id !== id) element(other.id).setAttribute("aria-pressed", "false");
+    view.observations.show(isOn ? quantity : null);
+    subscriptions.observations = isOn;
+  });
+}
 toggle("toggle-robot", "b", (isOn) => (view.robot.enabled = isOn));
 toggle("toggle-occlude", "o", (isOn) => (view.occlusion.enabled = isOn));
 

@@ -2,6 +2,7 @@
 
 import * as THREE from "three";
 import type { Crop } from "./crop_box";
+import { type ObservationLayer, TINT } from "./observation_layer";
 import { SOLID } from "./occlusion";
 import type { MeshChunkHeader } from "./protocol";
 import { inflated } from "./zlib";
@@ -14,15 +15,22 @@ export class MeshLayer {
   private readonly material: THREE.MeshBasicMaterial;
   private readonly chunks = new Map<number, THREE.Mesh>();
 
-  constructor() {
+  constructor(observations: ObservationLayer) {
     // Like the server, draws surface colors without shading, and only the observed side.
     this.material = new THREE.MeshBasicMaterial({ vertexColors: true, clippingPlanes: this.planes });
     // The depth is increased by the tolerance of occlusion, so that objects on the surface are not hidden.
     const factor = `1.0 + ${SOLID.relative} - ${SOLID.meters} / mvPosition.z`;
     this.material.onBeforeCompile = (shader) => {
-      shader.vertexShader = shader.vertexShader.replace(
+      Object.assign(shader.uniforms, observations.uniforms);
+      shader.vertexShader = `varying vec3 pointInWorld;\n${shader.vertexShader}`.replace(
         "#include <project_vertex>",
-        `#include <project_vertex>\n  gl_Position = projectionMatrix * vec4(mvPosition.xyz * (${factor}), 1.0);`,
+        `#include <project_vertex>
+  gl_Position = projectionMatrix * vec4(mvPosition.xyz * (${factor}), 1.0);
+  pointInWorld = (modelMatrix * vec4(transformed, 1.0)).xyz;`,
+      );
+      shader.fragmentShader = `varying vec3 pointInWorld;\n${TINT}\n${shader.fragmentShader}`.replace(
+        "#include <color_fragment>",
+        "#include <color_fragment>\n  diffuseColor.rgb = tinted(diffuseColor.rgb, pointInWorld);",
       );
     };
   }

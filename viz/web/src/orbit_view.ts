@@ -7,6 +7,7 @@ import type { PathView } from "./camera_path";
 import { CropBox } from "./crop_box";
 import { LocalModel } from "./local_model";
 import { MeasureTool } from "./measure";
+import { ObservationLayer } from "./observation_layer";
 import { Occlusion } from "./occlusion";
 import { Overlays } from "./overlays";
 import { PictureLayer } from "./picture_layer";
@@ -15,6 +16,7 @@ import type { PosedCamera, Scene } from "./protocol";
 import type { View } from "./render_scheduler";
 import { RobotLayer } from "./robot_layer";
 import { ScanLayer } from "./scan_layer";
+import type { ServerClock } from "./server_clock";
 import { surfacePoint } from "./surface_picker";
 
 const VERTICAL_FOV_DEGREES = 50;
@@ -23,12 +25,13 @@ export const BACKGROUND: [number, number, number] = [0x0b / 255, 0x0e / 255, 0x1
 
 export class OrbitView {
   readonly occlusion = new Occlusion();
-  readonly picture = new PictureLayer(this.occlusion);
+  readonly observations = new ObservationLayer(() => this.clock(), () => this.changed());
+  readonly picture = new PictureLayer(this.occlusion, this.observations);
   readonly overlays = new Overlays(this.occlusion);
   readonly points = new PointsLayer(this.occlusion);
   readonly scans = new ScanLayer(this.occlusion);
   readonly robot = new RobotLayer(this.occlusion, () => this.changed());
-  readonly local = new LocalModel(() => this.changed());
+  readonly local = new LocalModel(this.observations, () => this.changed());
   private readonly camera = new THREE.PerspectiveCamera(VERTICAL_FOV_DEGREES, 1, 0.01, 200);
   /** The picture. It is drawn first; the other objects compare their depth with the picture's in their shaders. */
   private readonly background = new THREE.Scene();
@@ -47,7 +50,11 @@ export class OrbitView {
   private isStale = true;
   private isModelShown = true;
 
-  constructor(private readonly canvas: HTMLCanvasElement, private readonly onMove: () => void) {
+  constructor(
+    private readonly canvas: HTMLCanvasElement,
+    private readonly onMove: () => void,
+    private readonly clock: () => ServerClock,
+  ) {
     this.renderer = new THREE.WebGLRenderer({ canvas, antialias: true });
     // Colors arrive as sRGB and are output unchanged.
     this.renderer.outputColorSpace = THREE.LinearSRGBColorSpace;

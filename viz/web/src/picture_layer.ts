@@ -7,6 +7,7 @@
 import * as THREE from "three";
 import { decodeCompactDepth } from "./compact_depth";
 import { worldFromCamera } from "./convention";
+import { type ObservationLayer, TINT } from "./observation_layer";
 import type { Occlusion } from "./occlusion";
 import type { DepthPart, PictureHeader } from "./protocol";
 import type { PosedDepth } from "./surface_picker";
@@ -32,7 +33,7 @@ const VERTEX = /* glsl */ `
 
 // Colors are looked up by projection, not by the grid's own coordinates, so that the view from the picture's pose is
 // exact even where a triangle spans a depth discontinuity.
-const FRAGMENT = /* glsl */ `
+const FRAGMENT = /* glsl */ `${TINT}
   uniform sampler2D colorMap;
   uniform sampler2D depthMap;
   uniform float emptyDepth;
@@ -41,15 +42,15 @@ const FRAGMENT = /* glsl */ `
   uniform vec2 sizePx;
   uniform vec2 focalPx;
   uniform vec2 principalPx;
+  uniform mat4 worldFromPicture;
   varying vec3 pointInPicture;
   void main() {
     vec2 uv = (focalPx * pointInPicture.xy / pointInPicture.z + principalPx) / sizePx;
-    if (isMoved) {
-      float depth = texture2D(depthMap, uv).r;
-      if (!(depth > 0.0)) depth = emptyDepth;
-      if (abs(pointInPicture.z - depth) > 0.08 * min(depth, pointInPicture.z)) discard;
-    }
-    gl_FragColor = vec4(texture2D(colorMap, uv).rgb, opacity);
+    float depth = texture2D(depthMap, uv).r;
+    if (!(depth > 0.0)) depth = emptyDepth;
+    if (isMoved && abs(pointInPicture.z - depth) > 0.08 * min(depth, pointInPicture.z)) discard;
+    vec3 pointInWorld = (worldFromPicture * vec4(pointInPicture * (depth / pointInPicture.z), 1.0)).xyz;
+    gl_FragColor = vec4(tinted(texture2D(colorMap, uv).rgb, pointInWorld), opacity);
   }`;
 
 export class PictureLayer {
@@ -61,7 +62,10 @@ export class PictureLayer {
   private hasColor = false;
   private shown: { id: number; stage: number } | null = null;
 
-  constructor(private readonly occlusion: Occlusion) {
+  constructor(
+    private readonly occlusion: Occlusion,
+    observations: ObservationLayer,
+  ) {
     const material = new THREE.ShaderMaterial({
       vertexShader: VERTEX,
       fragmentShader: FRAGMENT,
@@ -75,6 +79,7 @@ export class PictureLayer {
         emptyDepth: { value: 1 },
         isMoved: { value: false },
         opacity: { value: 1 },
+        ...observations.uniforms,
       },
       transparent: true,
       side: THREE.DoubleSide,

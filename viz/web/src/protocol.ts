@@ -18,6 +18,7 @@ export const CAPABILITIES = [
   "base_path",
   "control",
   "model_chunks",
+  "observations",
 ] as const;
 export type Capability = (typeof CAPABILITIES)[number];
 
@@ -326,11 +327,25 @@ export interface RangeScanHeader {
   meters_per_count: number;
 }
 
+/** When and how precisely each part of the scene was observed. */
+export interface ObservationsHeader {
+  type: "observations";
+  min_m: [number, number, number];
+  cell_m: number;
+  n_cells: [number, number, number];
+  n_views: number;
+  newest_millis: number | null;
+  min_age_secs: number;
+  min_sigma_m: number;
+  log_step: number;
+}
+
 export type BinaryHeader =
   | PictureHeader
   | LiveImageHeader
   | KeyframePointsHeader
   | RangeScanHeader
+  | ObservationsHeader
   | ModelChunkHeader;
 
 export interface HelloMessage {
@@ -349,7 +364,8 @@ export interface SubscribeMessage {
     | "keyframe_points"
     | "range_scans"
     | "base_path"
-    | "model_chunks";
+    | "model_chunks"
+    | "observations";
   rate_hz: number;
   camera?: string;
   size_px?: [number, number];

@@ -2,6 +2,7 @@
 
 import * as THREE from "three";
 import type { Crop } from "./crop_box";
+import type { ObservationLayer } from "./observation_layer";
 import type { SplatChunkHeader } from "./protocol";
 import { SplatMemory } from "./splat_memory";
 import { SPLAT_FRAGMENT, SPLAT_VERTEX } from "./splat_shader";
@@ -18,7 +19,10 @@ export class SplatLayer {
   /** What the newest requested order is for, and whether the splats have changed since. */
   private sortedFor = "";
 
-  constructor(private readonly changed: () => void) {
+  constructor(
+    observations: ObservationLayer,
+    private readonly changed: () => void,
+  ) {
     const geometry = new THREE.InstancedBufferGeometry();
     const corners = new Float32Array([-1, -1, 0, 1, -1, 0, 1, 1, 0, -1, 1, 0]);
     geometry.setAttribute("position", new THREE.BufferAttribute(corners, 3));
@@ -49,6 +53,7 @@ export class SplatLayer {
         depthRange: { value: new THREE.Vector2() },
         cropMin: { value: new THREE.Vector3() },
         cropMax: { value: new THREE.Vector3() },
+        ...observations.uniforms,
       },
     });
     this.mesh = new THREE.Mesh(geometry, material);

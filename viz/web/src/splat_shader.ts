@@ -1,6 +1,7 @@
 // Draws a splat as a quad. The twin of trainer/src/shared/projection.wgsl and coverage.wgsl: local pictures must equal
 // those of the server. trainer/src/splat/chunks/codec.rs encodes the splats.
 
+import { TINT } from "./observation_layer";
 import { UNIT_SPLATS } from "./splat_sorter";
 
 /** Texels per row of the textures with one texel per splat. */
@@ -32,6 +33,7 @@ export const SPLAT_VERTEX = /* glsl */ `
   out vec2 deviations;
   flat out vec4 color;
   flat out float reach;
+${TINT}
 
   const float MIN_ALPHA = 1.0 / 255.0;
   const float LOW_PASS_PX2 = 0.3;
@@ -117,7 +119,7 @@ export const SPLAT_VERTEX = /* glsl */ `
     if (steps.y > 0.0 || steps.z > 0.0) {
       rgb += viewDependent(texelFetch(harmonics, texel, 0), steps.yz, normalize(mean - eyeInModel));
     }
-    color = vec4(max(rgb, 0.0), alpha);
+    color = vec4(tinted(max(rgb, 0.0), inWorld), alpha);
   }`;
 
 export const SPLAT_FRAGMENT = /* glsl */ `

@@ -14,6 +14,8 @@ const POINTS_HZ = 20;
 /** Scans are sent this often, 36 kB each. */
 const SCANS_HZ = 2;
 const BASE_PATH_HZ = 1;
+/** Maps of observations per second, while they are shown; about 50 kB each. */
+const OBSERVATIONS_HZ = 0.5;
 /** Versions of the model per second, if the page draws it. */
 const CHUNKS_HZ = 1;
 /** Rate of the status, which the title bar needs, while the page is hidden. */
@@ -34,6 +36,7 @@ export class Subscriptions {
   private resizeTimer = 0;
   private showsPoints = false;
   private showsScans = true;
+  private showsObservations = false;
   private showsLargeImages = false;
   private drawnMethod: string | null = null;
 
@@ -71,6 +74,12 @@ export class Subscriptions {
   /** Whether range scans are shown. */
   set scans(shown: boolean) {
     this.showsScans = shown;
+    this.update();
+  }
+
+  /** Whether the model is tinted by its observations. */
+  set observations(shown: boolean) {
+    this.showsObservations = shown;
     this.update();
   }
 
@@ -116,6 +125,7 @@ export class Subscriptions {
       ["keyframe_points", this.showsPoints ? POINTS_HZ : 0],
       ["range_scans", this.showsScans ? SCANS_HZ : 0],
       ["base_path", BASE_PATH_HZ],
+      ["observations", this.showsObservations ? OBSERVATIONS_HZ : 0],
     ] as const;
     for (const [topic, rate_hz] of layers) {
       if (this.connection.supports(topic)) messages.push({ type: "subscribe", topic, rate_hz });
@@ -146,7 +156,7 @@ export class Subscriptions {
       messages.push({ type: "subscribe", topic: "live_images", camera, rate_hz: 0 });
     }
     if (this.connection.supports("robot")) messages.push({ type: "subscribe", topic: "robot_state", rate_hz: 0 });
-    for (const topic of ["keyframe_points", "range_scans", "base_path", "model_chunks"] as const) {
+    for (const topic of ["keyframe_points", "range_scans", "base_path", "observations", "model_chunks"] as const) {
       if (this.connection.supports(topic)) messages.push({ type: "subscribe", topic, rate_hz: 0 });
     }
     return messages;

@@ -1,0 +1,251 @@
+//! Publishes when and how precisely each part of the scene was observed, while a client shows it.
+
+mod map;
+
+use keyframe::{DepthMap, Keyframe};
+use kinematics::{Stamp, Transform};
+use map::ObservedView;
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
+use trainer::{Picture, Projection, RenderRequest};
+use viz::{Hub, KeyframePose};
+
+/// Maximum width of the depth maps. A cell of the map then meets several rays of most views.
+const MAX_WIDTH_PX: u32 = 96;
+/// Minimum time between two checks, and between two maps.
+const CHECK_PERIOD: Duration = Duration::from_millis(50);
+const MAP_PERIOD: Duration = Duration::from_secs(1);
+/// Time for rendering depth per check, unless a single picture takes longer.
+const RENDER_TIME: Duration = Duration::from_millis(5);
+/// Maximum fraction of the time for rendering, and of one processor for maps.
+const MAX_RENDER_FRAC: f64 = 0.1;
+const MAX_MAP_FRAC: f64 = 0.1;
+/// Depth is rendered again after this factor of training steps.
+const STEP_FACTOR: f64 = 1.5;
+/// Smaller changes of poses are not noticeable in the map.
+const NOTICEABLE_M: f64 = 1e-3;
+const NOTICEABLE_RAD: f64 = 1e-3;
+
+/// Camera and stamp of a keyframe.
+type Key = (Arc<str>, Stamp);
+
+/// A camera that has seen the scene.
+#[derive(Clone, Debug)]
+pub(crate) struct SeenFrom {
+    /// Pose and intrinsics, with corrections.
+    pub(crate) pose: KeyframePose,
+    /// The keyframe, if it is available. If it has depth, no depth is rendered.
+    pub(crate) keyframe: Option<Arc<Keyframe>>,
+}
+
+/// Depth of a view at a low resolution.
+#[derive(Clone, Debug)]
+struct KnownDepth {
+    /// The depth map; its pose is relative to the color camera.
+    depth: DepthMap,
+    is_measured: bool,
+    /// Training step at which it was rendered.
+    step: u64,
+}
+
+/// Computes the map on another thread.
+pub(crate) struct ObservationPublisher {
+    hub: Hub,
+    depths: BTreeMap<Key, KnownDepth>,
+    /// Whether a depth has changed since the last map.
+    is_changed: bool,
+    /// Poses in the last map.
+    mapped: BTreeMap<Key, Transform>,
+    task: Option<(Instant, JoinHandle<()>)>,
+    next_check: Instant,
+    next_map: Instant,
+}
+
+impl ObservationPublisher {
+    /// A publisher for the clients of a hub.
+    pub(crate) fn new(hub: Hub) -> Self {
+        let now = Instant::now();
+        Self {
+            hub,
+            depths: BTreeMap::new(),
+            is_changed: false,
+            mapped: BTreeMap::new(),
+            task: None,
+            next_check: now,
+            next_map: now,
+        }
+    }
+
+    /// Whether [`Self::publish`] should be called. Frees all memory while no client shows the map.
+    pub(crate) fn is_due(&mut self) -> bool {
+        if !self.hub.needs_observations() {
+            if !self.mapped.is_empty() || !self.depths.is_empty() {
+                *self = Self::new(self.hub.clone());
+            }
+            return false;
+        }
+        Instant::now() >= self.next_check
+    }
+
+    /// Renders missing depth of these views with `render`, a few per call, and starts to compute the map if it has
+    /// changed. `step`: training step of the model. `newest_at`: when the newest view was captured in this process.
+    /// Returns the time spent.
+    pub(crate) fn publish(
+        &mut self,
+        views: &[SeenFrom],
+        step: u64,
+        newest_at: Option<Instant>,
+        render: impl FnMut(&RenderRequest) -> Result<Picture, trainer::Error>,
+    ) -> Duration {
+        let began = Instant::now();
+        let keys: BTreeSet<Key> = views.iter().map(SeenFrom::key).collect();
+        let n_before = self.depths.len();
+        self.depths.retain(|key, _| keys.contains(key));
+        self.is_changed |= self.depths.len() < n_before;
+        self.add_measured(views);
+        self.render_depths(views, step, render);
+        self.start_map(views, newest_at);
+        let spent = began.elapsed();
+        self.next_check = Instant::now() + CHECK_PERIOD.max(spent.div_f64(MAX_RENDER_FRAC));
+        spent
+    }
+
+    fn add_measured(&mut self, views: &[SeenFrom]) {
+        for view in views {
+            let Some(depth) = view.keyframe.as_ref().and_then(|keyframe| measured_depth(keyframe)) else { continue };
+            let std::collections::btree_map::Entry::Vacant(entry) = self.depths.entry(view.key()) else { continue };
+            entry.insert(KnownDepth { depth: depth(), is_measured: true, step: u64::MAX });
+            self.is_changed = true;
+        }
+    }
+
+    /// Renders depth for the newest views that have none, and then for those whose depth is oldest.
+    fn render_depths(
+        &mut self,
+        views: &[SeenFrom],
+        step: u64,
+        mut render: impl FnMut(&RenderRequest) -> Result<Picture, trainer::Error>,
+    ) {
+        #[expect(clippy::cast_precision_loss, reason = "steps are far below 2^52")]
+        let is_outdated = |known: &KnownDepth| !known.is_measured && step as f64 > STEP_FACTOR * known.step as f64;
+        let rendered_at = |view: &SeenFrom| self.depths.get(&view.key()).map(|known| known.step);
+        let mut due: Vec<_> =
+            views.iter().filter(|view| self.depths.get(&view.key()).is_none_or(is_outdated)).collect();
+        due.sort_by_key(|view| (rendered_at(view), std::cmp::Reverse(view.pose.stamp.0)));
+        let began = Instant::now();
+        for view in due {
+            let request = depth_request(&view.pose);
+            let depth = match render(&request) {
+                Ok(picture) => depth_map(&request, picture),
+                Err(error) => {
+                    // A lost device is detected by training, too.
+                    log::debug!("no depth for the map of observations: {error}");
+                    return;
+                }
+            };
+            self.depths.insert(view.key(), KnownDepth { depth, is_measured: false, step });
+            self.is_changed = true;
+            if began.elapsed() >= RENDER_TIME {
+                return;
+            }
+        }
+    }
+
+    /// Starts to compute the map if it has changed and the last one is complete.
+    fn start_map(&mut self, views: &[SeenFrom], newest_at: Option<Instant>) {
+        if let Some((began, _)) = self.task.take_if(|(_, thread)| thread.is_finished()) {
+            self.next_map = began + MAP_PERIOD.max(began.elapsed().div_f64(MAX_MAP_FRAC));
+        }
+        if self.task.is_some() || Instant::now() < self.next_map {
+            return;
+        }
+        let has_moved = |view: &SeenFrom| match self.mapped.get(&view.key()) {
+            Some(mapped) => is_noticeable(&(mapped.inverse() * view.pose.world_from_camera)),
+            None => false, // It has no depth yet.
+        };
+        if !self.is_changed && !views.iter().any(has_moved) {
+            return;
+        }
+        let known = views.iter().filter_map(|view| Some((view, self.depths.get(&view.key())?)));
+        let observed: Vec<_> = known.clone().map(|(view, known)| known.seen_from(&view.pose)).collect();
+        self.mapped = known.map(|(view, _)| (view.key(), view.pose.world_from_camera)).collect();
+        self.is_changed = false;
+        let hub = self.hub.clone();
+        let compute = move || {
+            if let Some(map) = map::map_of(&observed) {
+                hub.set_observations(&viz::ObservationMap { newest_at, ..map });
+            }
+        };
+        self.task = Some((Instant::now(), std::thread::spawn(compute)));
+    }
+}
+
+impl SeenFrom {
+    fn key(&self) -> Key {
+        (Arc::clone(&self.pose.camera), self.pose.stamp)
+    }
+}
+
+impl KnownDepth {
+    /// The view with the current pose of its color camera.
+    fn seen_from(&self, pose: &KeyframePose) -> ObservedView {
+        let world_from_camera = pose.world_from_camera * self.depth.world_from_camera;
+        ObservedView {
+            stamp: pose.stamp,
+            depth: DepthMap { world_from_camera, ..self.depth.clone() },
+            pixel_rad: 1.0 / pose.focal_px[0],
+            is_measured: self.is_measured,
+        }
+    }
+}
+
+fn is_noticeable(motion: &Transform) -> bool {
+    motion.translation.vector.norm() > NOTICEABLE_M || motion.rotation.angle() > NOTICEABLE_RAD
+}
+
+/// How to compute the depth of a keyframe at a low resolution, relative to its color camera; `None` without depth.
+fn measured_depth(keyframe: &Keyframe) -> Option<impl FnOnce() -> DepthMap> {
+    let depth = keyframe.depth.as_ref()?;
+    let camera_from_depth = keyframe.world_from_camera.inverse() * depth.world_from_camera;
+    Some(move || {
+        let stride = depth.size_px[0].div_ceil(MAX_WIDTH_PX).max(1) | 1; // Must be odd.
+        DepthMap { world_from_camera: camera_from_depth, ..depth.subsampled(stride) }
+    })
+}
+
+/// The request for the depth of a view at a low resolution.
+fn depth_request(pose: &KeyframePose) -> RenderRequest {
+    let scale = f64::from(MAX_WIDTH_PX.min(pose.size_px[0])) / f64::from(pose.size_px[0]);
+    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "smaller than the image")]
+    let size_px = pose.size_px.map(|size| ((f64::from(size) * scale).round() as u32).max(1));
+    let axes = [0, 1].map(|axis| f64::from(size_px[axis]) / f64::from(pose.size_px[axis]));
+    let scaled = |values: [f64; 2]| [values[0] * axes[0], values[1] * axes[1]];
+    RenderRequest {
+        world_from_camera: pose.world_from_camera,
+        size_px,
+        projection: Projection::Pinhole { focal_px: scaled(pose.focal_px), principal_px: scaled(pose.principal_px) },
+        shutter: None,
+        near_m: 0.01,
+        far_m: 100.0,
+        crop: None,
+        background_srgb: [0.0; 3],
+        appearance_of: None,
+        depth: true,
+    }
+}
+
+/// The depth of a rendered picture; its pose is relative to the color camera.
+fn depth_map(request: &RenderRequest, picture: Picture) -> DepthMap {
+    let Projection::Pinhole { focal_px, principal_px } = request.projection else {
+        unreachable!("depth is requested with a pinhole")
+    };
+    DepthMap {
+        size_px: picture.size_px,
+        focal_px,
+        principal_px,
+        depth_m: picture.depth_m.into(),
+        world_from_camera: Transform::identity(),
+    }
+}
