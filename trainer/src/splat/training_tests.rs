@@ -7,7 +7,7 @@ use crate::eval::{PixelPair, psnr};
 use crate::gpu::{Gpu, GpuOptions, f32s_of};
 use crate::model_options::{CommonOptions, ModelOptions};
 use crate::view::Camera;
-use crate::{Method, Packing, Projection, RenderRequest, Rendered};
+use crate::{Aabb, Method, Packing, Projection, RenderRequest, Rendered};
 use calibration::{CameraRefinement, ParamSet};
 use keyframe::{DepthMap, Keyframe, Split};
 use kinematics::{Stamp, Transform};
@@ -304,6 +304,32 @@ fn late_keyframe_resumes_growth() {
     // A second copy of an image has no uncovered area to seed.
     trainer.push(Arc::new(Keyframe { stamp: Stamp(99), ..keyframes[1].as_ref().clone() })).unwrap();
     assert!(n_splats_after(&mut trainer, 120) > planned, "growth continues");
+}
+
+#[test]
+fn crop_box_limits_the_picture() {
+    /// More than the radius of a disc.
+    const MARGIN_M: f64 = 2.0;
+    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let mut model = SplatTrainer::from_arrays(gpu, ModelOptions::default(), &scene()).unwrap();
+    let whole = request(pose(0));
+    let picture = model.render(&whole).unwrap();
+    // A rotated box with one face through the middle of the view.
+    let crop = Aabb { world_from_box: pose(0), min_m: [0.0, -20.0, -20.0], max_m: [20.0; 3] };
+    let cropped = model.render(&RenderRequest { crop: Some(crop), ..whole.clone() }).unwrap();
+    let [mut n_inside, mut n_outside] = [0; 2];
+    for (ix, depth_m) in picture.depth_m.iter().enumerate() {
+        let x_m = ((ix % SIZE_PX[0] as usize) as f64 + 0.5 - 48.0) / FOCAL_PX * f64::from(*depth_m);
+        let pixels = [&picture, &cropped].map(|picture| &picture.rgba_srgb[4 * ix..4 * ix + 4]);
+        if x_m > MARGIN_M {
+            n_inside += 1;
+            assert_eq!(pixels[0], pixels[1], "pixel {ix}");
+        } else if x_m < -MARGIN_M {
+            n_outside += 1;
+            assert_eq!((pixels[1], cropped.depth_m[ix]), (&[0; 4][..], 0.0), "pixel {ix}");
+        }
+    }
+    assert!(n_inside > 500 && n_outside > 500, "{n_inside} {n_outside}");
 }
 
 /// The newest image must not wait for the next one.
