@@ -35,6 +35,7 @@ mod message_checks;
 mod negotiation;
 mod page;
 mod picture;
+mod picture_times;
 mod pose;
 mod positions;
 mod protocol;
@@ -57,6 +58,7 @@ pub use error::Error;
 #[cfg(feature = "foxglove")]
 pub use foxglove_server::FoxgloveServer;
 pub use hub::{Hub, PendingRender};
+pub use picture_times::{NewestKeyframe, ShownPicture, TrainedKeyframes};
 pub use protocol::{BASE_PROTOCOL_VERSION, Control, PROTOCOL_VERSION};
 pub use range_scan::RangeScan;
 pub use robot::{MeshFormat, RobotDescription, RobotMesh, RobotState};

@@ -3,7 +3,7 @@
 use crate::protocol::{BASE_PROTOCOL_VERSION, ClientHello, PROTOCOL_VERSION};
 
 /// Names of the capabilities of this server.
-pub(crate) const CAPABILITIES: [&str; 12] = [
+pub(crate) const CAPABILITIES: [&str; 13] = [
     "views",
     "subscribe",
     "compact_depth",
@@ -16,6 +16,7 @@ pub(crate) const CAPABILITIES: [&str; 12] = [
     "base_path",
     "control",
     "model_chunks",
+    "shown",
 ];
 const KEYFRAME_CHANGES: &str = "keyframe_changes";
 const PARTS: &str = "parts";

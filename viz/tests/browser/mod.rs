@@ -11,6 +11,9 @@ use tungstenite::{Message, WebSocket};
 /// Far more than a browser needs on two busy cores.
 const TIMEOUT: Duration = Duration::from_secs(60);
 
+/// A script for [`Browser::open_with`] that replaces WebGL, because drawing on the CPU takes most of the time.
+pub(crate) const WEBGL_STUB: &str = include_str!("webgl_stub.js");
+
 /// A running browser with one page.
 pub(crate) struct Browser {
     process: Child,

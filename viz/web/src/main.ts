@@ -17,6 +17,7 @@ import { Readouts } from "./readouts";
 import { RenderScheduler } from "./render_scheduler";
 import { RobotAge } from "./robot_age";
 import { RunControls } from "./run_controls";
+import { ShownLatency } from "./shown_latency";
 import { Subscriptions } from "./subscriptions";
 import { ViewSettings } from "./view_settings";
 
@@ -53,6 +54,7 @@ const connection = new Connection(`${location.protocol === "https:" ? "wss" : "w
       liveImages.forget();
       robotAge.forget();
       scheduler.restart();
+      shownLatency.forget();
       view.points.clear();
       view.scans.clear();
       view.scans.setPath([]);
@@ -71,7 +73,9 @@ const subscriptions = new Subscriptions(connection, liveImages);
 const keyframes = new KeyframeList();
 const runControls = new RunControls(connection);
 new LinkReadout(connection);
+const shownLatency = new ShownLatency(connection);
 const models = new ModelSwitch(() => {
+  shownLatency.forget();
   scheduler.restart();
   if (latestStatus) showStatus(latestStatus);
 });
@@ -186,6 +190,7 @@ function receiveBinary(header: BinaryHeader, payload: Uint8Array<ArrayBuffer>): 
 
 async function showPicture(header: PictureHeader, payload: Uint8Array<ArrayBuffer>): Promise<void> {
   const millis = scheduler.answered(header);
+  const receivedAt = performance.now();
   try {
     if (!(await view.picture.show(header, payload, view.emptyDepth))) return;
   } catch (error) {
@@ -193,6 +198,8 @@ async function showPicture(header: PictureHeader, payload: Uint8Array<ArrayBuffe
     element("notice").textContent = `Cannot show a picture: ${error instanceof Error ? error.message : String(error)}`;
     return;
   }
+  if (header.color && showsModel) shownLatency.pictureReady(header, receivedAt);
+  else shownLatency.restart();
   view.changed();
   element("notice").textContent = "";
   if (!header.color) return;
@@ -270,6 +277,7 @@ toggle("toggle-robot", "b", (isOn) => (view.robot.enabled = isOn));
 toggle("toggle-occlude", "o", (isOn) => (view.occlusion.enabled = isOn));
 
 function frame(): void {
+  shownLatency.frameBegins();
   settings.tick();
   scheduler.tick();
   view.draw();
