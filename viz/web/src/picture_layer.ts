@@ -52,6 +52,15 @@ const FRAGMENT = /* glsl */ `
     gl_FragColor = vec4(texture2D(colorMap, uv).rgb, opacity);
   }`;
 
+/** A picture that has been received, and what becomes of it: whether it is shown. */
+interface Received {
+  header: PictureHeader;
+  payload: Uint8Array<ArrayBuffer>;
+  emptyDepth: number;
+  resolve: (isShown: boolean) => void;
+  reject: (reason: unknown) => void;
+}
+
 export class PictureLayer {
   readonly mesh: THREE.Mesh<THREE.BufferGeometry, THREE.ShaderMaterial>;
   /** The depth of the shown picture. */
@@ -60,6 +69,8 @@ export class PictureLayer {
   /** Whether the newest picture has colors. */
   private hasColor = false;
   private shown: { id: number; stage: number } | null = null;
+  private waiting: Received | null = null;
+  private isDecoding = false;
 
   constructor(private readonly occlusion: Occlusion) {
     const material = new THREE.ShaderMaterial({
@@ -102,8 +113,32 @@ export class PictureLayer {
     uniforms.isMoved!.value = worldFromView.elements.some((value, ix) => Math.abs(value - picture[ix]!) > 1e-4);
   }
 
-  /** Shows a picture unless a newer one is already shown. Returns whether it did. A picture may consist of depth only. */
-  async show(header: PictureHeader, payload: Uint8Array<ArrayBuffer>, emptyDepth: number): Promise<boolean> {
+  /**
+   * Shows a picture, unless a newer one arrives while an older one is decoded. Returns whether it did. A picture may
+   * consist of depth only.
+   */
+  show(header: PictureHeader, payload: Uint8Array<ArrayBuffer>, emptyDepth: number): Promise<boolean> {
+    return new Promise((resolve, reject) => {
+      this.waiting?.resolve(false);
+      this.waiting = { header, payload, emptyDepth, resolve, reject };
+      if (!this.isDecoding) void this.decodeWaiting();
+    });
+  }
+
+  private async decodeWaiting(): Promise<void> {
+    this.isDecoding = true;
+    for (let next = this.waiting; next; next = this.waiting) {
+      this.waiting = null;
+      await this.decode(next.header, next.payload, next.emptyDepth).then(next.resolve, next.reject);
+    }
+    this.isDecoding = false;
+  }
+
+  private async decode(
+    header: PictureHeader,
+    payload: Uint8Array<ArrayBuffer>,
+    emptyDepth: number,
+  ): Promise<boolean> {
     if (header.projection.kind !== "pinhole") return false;
     const [bitmap, depth] = await Promise.all([
       header.color ? unpackColor(header.color, payload) : null,
