@@ -20,7 +20,7 @@ use std::io::{BufRead, BufReader, ErrorKind};
 use std::net::TcpStream;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
-use std::sync::mpsc::{Sender, channel};
+use std::sync::mpsc::{SyncSender, sync_channel};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 use tungstenite::{Message, WebSocket};
@@ -121,12 +121,12 @@ fn view_of(request: &Value) -> PinholeView {
 }
 
 /// A view, and where its depth is sent.
-type DepthJob = (PinholeView, Sender<Vec<f32>>);
+type DepthJob = (PinholeView, SyncSender<Vec<f32>>);
 
 /// Starts a thread that renders the depth of the scene without the robot.
-fn start_renderer() -> Sender<DepthJob> {
-    let (jobs, queue) = channel::<DepthJob>();
-    let (ready, started) = channel();
+fn start_renderer() -> SyncSender<DepthJob> {
+    let (jobs, queue) = sync_channel::<DepthJob>(1);
+    let (ready, started) = sync_channel(1);
     std::thread::spawn(move || {
         let mut scene = RobotMasks::open(Scene::StaticArm, WINDOW_PX).expect("the scene is valid");
         ready.send(()).expect("the test waits");
@@ -140,7 +140,7 @@ fn start_renderer() -> Sender<DepthJob> {
 
 /// What the page shows and has requested.
 struct Stage {
-    renderer: Mutex<Sender<DepthJob>>,
+    renderer: Mutex<SyncSender<DepthJob>>,
     robot: Value,
     state: Mutex<Value>,
     last_request: Mutex<Value>,
@@ -190,7 +190,7 @@ impl Stage {
     }
 
     fn depth_m(&self, view: PinholeView) -> Vec<f32> {
-        let (reply, depth_m) = channel();
+        let (reply, depth_m) = sync_channel(1);
         self.renderer.lock().expect("no panic").send((view, reply)).expect("it renders");
         depth_m.recv().expect("it renders")
     }

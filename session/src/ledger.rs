@@ -169,8 +169,9 @@ mod tests {
         assert_eq!(newest(ledger.trained_keyframes(1, 6)), (4, pushed(3)), "the second model");
         let captured = ledger.keyframes()[0].captured_at();
         let at = |millis| captured + Duration::from_millis(millis);
+        let reversed = std::ops::Range { start: 2, end: 1 }; // A picture that was drawn before the previous one.
         for (new_keyframes, sent, shown) in
-            [(0..0, 10, 15), (1..2, 30, 45), (1..3, 40, 60), (3..99, 50, 70), (2..1, 1, 1)]
+            [(0..0, 10, 15), (1..2, 30, 45), (1..3, 40, 60), (3..99, 50, 70), (reversed, 1, 1)]
         {
             let (sent_at, shown_at) = (at(sent), at(shown));
             ledger.shown(&ShownPicture { method: None, new_keyframes, sent_at, shown_at });

@@ -422,7 +422,7 @@ impl PendingRender {
         self.job.view_request.method.as_deref()
     }
 
-    /// Tells the client which keyframes the model has been trained on.
+    /// Sets the keyframes on which the model has been trained, of which the client is informed.
     #[must_use]
     pub fn of_keyframes(mut self, trained_on: TrainedKeyframes) -> Self {
         self.trained_on = Some(trained_on);

@@ -71,6 +71,8 @@ export class PictureLayer {
   private shown: { id: number; stage: number } | null = null;
   private waiting: Received | null = null;
   private isDecoding = false;
+  /** Number of servers so far. */
+  private nServers = 0;
 
   constructor(private readonly occlusion: Occlusion) {
     const material = new THREE.ShaderMaterial({
@@ -140,11 +142,15 @@ export class PictureLayer {
     emptyDepth: number,
   ): Promise<boolean> {
     if (header.projection.kind !== "pinhole") return false;
+    const server = this.nServers;
     const [bitmap, depth] = await Promise.all([
       header.color ? unpackColor(header.color, payload) : null,
       unpackDepth(header.depth, payload),
     ]);
-    if (this.shown && (this.shown.id > header.id || (this.shown.id === header.id && this.shown.stage > header.stage))) {
+    const isOlder =
+      this.shown &&
+      (this.shown.id > header.id || (this.shown.id === header.id && this.shown.stage > header.stage));
+    if (isOlder || server !== this.nServers) {
       bitmap?.close();
       return false;
     }
@@ -174,8 +180,11 @@ export class PictureLayer {
     return true;
   }
 
-  /** Resets the numbering, because a new server counts from the start. */
+  /** Resets the numbering, because a new server counts from the start. Pictures of the old server are not shown. */
   forget(): void {
+    this.nServers += 1;
+    this.waiting?.resolve(false);
+    this.waiting = null;
     this.shown = null;
   }
 }
