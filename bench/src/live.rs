@@ -11,15 +11,17 @@ use capture::config::Parent;
 use capture::{InputResult, Rig};
 use keyframe::counted;
 use kinematics::Transform;
-use kinematics::quantile::{Rank, quantile};
 use kinematics::random::Random;
 use nalgebra::{UnitQuaternion, UnitVector3, Vector3};
 use serde::Serialize;
 use session::chart::{Axis, Chart, Line, Point, Scale};
-use session::{KeyframeTimes, Live, Table};
+use session::{KeyframeTimes, Latency, Live, Table};
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
-use std::time::{Duration, Instant};
+use std::time::Duration;
+
+/// Name of the last latency of a keyframe.
+const SHOWN: &str = "shutter to shown";
 
 /// An error of the hand-eye calibration.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
@@ -68,26 +70,6 @@ impl fmt::Display for Conditions {
         f.write_str(&counted(self.n_viewers, "viewer"))?;
         self.hand_eye_error.map_or(Ok(()), |error| write!(f, ", {error}"))?;
         self.disturbance.map_or(Ok(()), |disturbance| write!(f, ", {disturbance}"))
-    }
-}
-
-/// Median and 99th percentile of durations, milliseconds.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
-pub struct Latency {
-    /// Median.
-    pub p50: f64,
-    /// 99th percentile.
-    pub p99: f64,
-    /// Number of durations.
-    pub n: usize,
-}
-
-impl Latency {
-    /// `None` if there are no durations.
-    fn of(millis: impl IntoIterator<Item = f64>) -> Option<Self> {
-        let mut millis: Vec<f64> = millis.into_iter().collect();
-        let p50 = quantile(&mut millis, 0.5, Rank::Lower)?;
-        Some(Self { p50, p99: quantile(&mut millis, 0.99, Rank::Lower)?, n: millis.len() })
     }
 }
 
@@ -186,15 +168,11 @@ impl LiveRun {
 fn latencies(pictures: &[Vec<ReceivedPicture>], keyframes: &[KeyframeTimes]) -> Vec<(String, Latency)> {
     let of_pictures =
         |name, millis: fn(&ReceivedPicture) -> f64| (name, Latency::of(pictures.iter().flatten().map(millis)));
-    let since_shutter = |at: &dyn Fn(&KeyframeTimes) -> Option<Instant>| {
-        let millis_of =
-            |keyframe: &KeyframeTimes| Some(millis(at(keyframe)?.checked_duration_since(keyframe.input.captured?)?));
-        Latency::of(keyframes.iter().filter_map(millis_of))
-    };
     let cameras: BTreeSet<&str> = keyframes.iter().map(|keyframe| &*keyframe.camera).collect();
     let of_camera = |camera: &&str| {
-        let pushed = since_shutter(&|keyframe| (*keyframe.camera == **camera).then_some(keyframe.pushed));
-        (format!("shutter to model, camera {camera}"), pushed)
+        let keyframes = keyframes.iter().filter(|keyframe| *keyframe.camera == **camera);
+        let pushed = Latency::of(keyframes.filter_map(|keyframe| keyframe.millis_until(keyframe.pushed)));
+        Some((format!("shutter to model, camera {camera}"), pushed?))
     };
     let to_picture = pictures.first().and_then(|pictures| Latency::of(shutter_to_picture(pictures, keyframes)));
     let named = [
@@ -207,15 +185,15 @@ fn latencies(pictures: &[Vec<ReceivedPicture>], keyframes: &[KeyframeTimes]) -> 
             let on_server = picture.waited_millis + picture.render_millis + picture.encode_millis;
             (millis(picture.complete - picture.requested) - on_server).max(0.0)
         }),
-        ("shutter to arrival", since_shutter(&|keyframe| Some(keyframe.input.arrived))),
-        ("shutter to keyframe", since_shutter(&|keyframe| Some(keyframe.input.queued))),
-        ("shutter to model", since_shutter(&|keyframe| Some(keyframe.pushed))),
-        ("shutter to first step", since_shutter(&|keyframe| keyframe.trained)),
-        ("shutter to picture", to_picture),
     ];
-    let of_cameras = cameras.iter().map(of_camera).filter(|_| cameras.len() > 1);
-    let named = named.into_iter().map(|(name, latency)| (name.to_owned(), latency)).chain(of_cameras);
-    named.filter_map(|(name, latency)| Some((name, latency?))).collect()
+    let named = named.into_iter().filter_map(|(name, latency)| Some((name.to_owned(), latency?)));
+    let mut since_shutter = session::latencies(keyframes);
+    let shown_at = since_shutter.iter().position(|(name, _)| name == SHOWN).unwrap_or(since_shutter.len());
+    if let Some(to_picture) = to_picture {
+        since_shutter.insert(shown_at, ("shutter to picture".to_owned(), to_picture));
+    }
+    let of_cameras = cameras.iter().filter_map(of_camera).filter(|_| cameras.len() > 1);
+    named.chain(since_shutter).chain(of_cameras).collect()
 }
 
 /// For each keyframe, the time from mid-exposure to the arrival of the first picture that contains it, milliseconds.
@@ -227,7 +205,7 @@ fn shutter_to_picture<'a>(
     (1..).zip(keyframes).filter_map(move |(n, keyframe)| {
         let first = rest.iter().position(|picture| picture.n_keyframes >= n)?;
         rest = &rest[first..];
-        Some(millis(rest[0].complete.checked_duration_since(keyframe.input.captured?)?))
+        keyframe.millis_until(rest[0].complete)
     })
 }
 
@@ -344,6 +322,7 @@ mod tests {
     use super::*;
     use capture::InputTimes;
     use kinematics::Stamp;
+    use std::time::Instant;
 
     fn at(began: Instant, after_millis: u64) -> Instant {
         began + Duration::from_millis(after_millis)
@@ -356,8 +335,10 @@ mod tests {
             stamp: Stamp(0),
             input: InputTimes { captured: Some(captured), arrived: at(captured, 5), queued: at(captured, 8) },
             pushed: at(captured, 12),
-            pushed_at_step: 0,
+            pushed_at_steps: vec![0],
             trained: Some(at(captured, 20)),
+            sent: Some(at(captured, 24)),
+            shown: Some(at(captured, 33)),
         }
     }
 
@@ -385,6 +366,9 @@ mod tests {
         assert_eq!(p50("request to complete picture"), 30.0);
         assert_eq!(p50("picture: transfer"), 24.0);
         assert_eq!(["shutter to arrival", "shutter to model", "shutter to first step"].map(p50), [5.0, 12.0, 20.0]);
+        let names: Vec<&str> = latencies.iter().map(|(name, _)| &**name).collect();
+        assert_eq!(names[names.len() - 3..], ["shutter to sent", "shutter to picture", "shutter to shown"]);
+        assert_eq!(["shutter to sent", SHOWN].map(p50), [24.0, 33.0]);
     }
 
     #[test]

@@ -1,7 +1,7 @@
 //! A viewer for benches: a WebSocket client that requests images back to back and discards them.
 //!
-//! It uses the capabilities that the web page uses for pictures. It runs in the measured process and decodes nothing, to
-//! affect the measurement little.
+//! It uses the capabilities that the web page uses for pictures. It runs in the measured process. To affect the
+//! measurement little, it decodes only the first picture with a new keyframe, and reports that it has shown it.
 
 use crate::Result;
 use keyframe::{ensure, failed};
@@ -102,6 +102,8 @@ impl Viewer {
             center_m: Point3::origin(),
             radius_m: 1.0,
             parts: Vec::new(),
+            server_started: None,
+            n_keyframes: 0,
         };
         client.handshake(address)?;
         let thread = std::thread::Builder::new().name("viewer".into()).spawn(move || client.run());
@@ -153,6 +155,10 @@ struct Client {
     radius_m: f64,
     /// The parts received so far of a message that the server sends in parts.
     parts: Vec<u8>,
+    /// Estimated time at which the server's clock started; at most the delay of a message late.
+    server_started: Option<Instant>,
+    /// Largest number of keyframes in a picture so far.
+    n_keyframes: u64,
 }
 
 impl Client {
@@ -176,7 +182,7 @@ impl Client {
         let hello = json!({
             "type": "hello",
             "protocols": [PROTOCOL_VERSION, PROTOCOL_VERSION],
-            "capabilities": ["subscribe", "compact_depth", "keyframe_changes", "parts"],
+            "capabilities": ["subscribe", "compact_depth", "keyframe_changes", "parts", "shown"],
         });
         self.send(TEXT, hello.to_string().as_bytes())?;
         self.request_picture()?;
@@ -199,6 +205,10 @@ impl Client {
     fn handle_text(&mut self, n_bytes: u64) -> Result<()> {
         ensure!(n_bytes <= MAX_TEXT_BYTES, "a text message of {n_bytes} bytes, expected at most {MAX_TEXT_BYTES}");
         let message: Value = serde_json::from_reader((&mut self.reader).take(n_bytes))?;
+        if let Some(clock) = message["clock_millis"].as_f64().and_then(|n| Duration::try_from_secs_f64(n * 1e-3).ok()) {
+            let started = Instant::now().checked_sub(clock);
+            self.server_started = self.server_started.into_iter().chain(started).min();
+        }
         match message["type"].as_str() {
             Some("scene") => {
                 let number = |value: &Value| value.as_f64().ok_or_else(|| failed!("a scene message lacks a number"));
@@ -230,20 +240,21 @@ impl Client {
         ensure!(n_read as u64 == n_bytes, "the server closed the connection within a message");
         let (header, payload) = split(&message)?;
         if header["type"] != "part" {
-            return self.handle_picture(&header);
+            return self.handle_picture(&header, payload);
         }
         if header["offset"] == 0 {
             self.parts.clear();
         }
         self.parts.extend_from_slice(payload);
         if header["bytes"] == self.parts.len() {
-            let header = split(&self.parts)?.0;
-            self.handle_picture(&header)?;
+            let joined = std::mem::take(&mut self.parts);
+            let (header, payload) = split(&joined)?;
+            self.handle_picture(&header, payload)?;
         }
         Ok(())
     }
 
-    fn handle_picture(&mut self, header: &Value) -> Result<()> {
+    fn handle_picture(&mut self, header: &Value, payload: &[u8]) -> Result<()> {
         // A picture of an earlier request may still arrive after an error.
         if header["type"] != "picture" || header["id"] != self.n_requested.saturating_sub(1) {
             return Ok(());
@@ -252,6 +263,7 @@ impl Client {
         let first_stage = *self.first_stage.get_or_insert(now);
         if header["last"] == true {
             let millis = |name: &str| header[name].as_f64().unwrap_or_default();
+            let n_keyframes = header["keyframes"].as_u64().unwrap_or_default();
             self.pictures.lock().push(ReceivedPicture {
                 requested: self.requested,
                 first_stage,
@@ -259,12 +271,29 @@ impl Client {
                 waited_millis: millis("waited_millis"),
                 render_millis: millis("render_millis"),
                 encode_millis: millis("encode_millis"),
-                n_keyframes: header["keyframes"].as_u64().unwrap_or_default(),
+                n_keyframes,
             });
+            if n_keyframes > self.n_keyframes {
+                self.n_keyframes = n_keyframes;
+                self.show(header, payload)?;
+            }
             std::thread::sleep(self.options.period.saturating_sub(self.requested.elapsed()));
             self.request_picture()?;
         }
         Ok(())
+    }
+
+    /// Decodes a picture and reports that it is shown.
+    fn show(&mut self, header: &Value, payload: &[u8]) -> Result<()> {
+        let number = |name: &str| header["color"][name].as_u64().and_then(|n| usize::try_from(n).ok());
+        let jpeg = number("offset").zip(number("bytes")).and_then(|(offset, n)| payload.get(offset..)?.get(..n));
+        let jpeg = jpeg.ok_or_else(|| failed!("a picture without color: {header}"))?;
+        image::load_from_memory_with_format(jpeg, image::ImageFormat::Jpeg)
+            .map_err(|error| failed!("cannot decode a picture: {error}"))?;
+        let Some(started) = self.server_started else { return Ok(()) };
+        let shown_millis = started.elapsed().as_secs_f64() * 1e3;
+        let shown = json!({ "type": "shown", "id": header["id"], "shown_millis": shown_millis });
+        self.send(TEXT, shown.to_string().as_bytes())
     }
 
     /// Requests the next image on a circle around the scene.
@@ -352,7 +381,7 @@ fn split(message: &[u8]) -> Result<(Value, &[u8])> {
 mod tests {
     use super::*;
     use trainer::Picture;
-    use viz::{Hub, Server, ServerConfig};
+    use viz::{Hub, NewestKeyframe, Server, ServerConfig, TrainedKeyframes};
 
     #[test]
     fn viewer_receives_pictures_and_disconnects() {
@@ -374,10 +403,23 @@ mod tests {
             } else {
                 let size_px = pending.request.size_px;
                 let n = (size_px[0] * size_px[1]) as usize;
+                let now = Instant::now();
+                let newest = NewestKeyframe { captured_at: now, added_at: now };
+                let pending = pending.of_keyframes(TrainedKeyframes { n: n_drawn, newest: Some(newest) });
                 pending.deliver(Picture { size_px, rgba_srgb: vec![128; 4 * n], depth_m: vec![1.0; n] });
             }
             n_drawn += 1;
         }
+        let mut shown = Vec::new();
+        while shown.len() < 3 {
+            assert!(started.elapsed() < Duration::from_secs(60), "{shown:?}");
+            shown.append(&mut hub.take_shown_pictures());
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        assert!(shown[0].new_keyframes.is_empty() && !shown[1].new_keyframes.is_empty(), "{shown:?}");
+        // The viewer estimates the server's clock to a fraction of a millisecond.
+        let decoding = shown.iter().map(|picture| picture.shown_at - picture.sent_at);
+        assert!(decoding.clone().all(|time| time < started.elapsed()) && decoding.max() > Some(Duration::ZERO));
         assert!(n_drawn >= 4, "one failed request and three images, with one stage each if the server renders fast");
         drop(viewer);
         while hub.n_clients() > 0 {

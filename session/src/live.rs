@@ -74,7 +74,7 @@ pub struct Live {
     notes: Vec<String>,
     device_notes: Notes,
     recoveries: Recoveries,
-    /// Times of the keyframes of the first session.
+    /// Times of the keyframes.
     ledger: Ledger,
     keyframe_change: Option<KeyframeChange>,
     /// Whether an operator has paused training.
@@ -202,7 +202,7 @@ impl Live {
         self.n_evicted
     }
 
-    /// Times at which each keyframe passed the stages from the camera to the first model.
+    /// Times at which each keyframe passed the stages from the camera to the screens of viewers.
     pub fn ledger(&self) -> &Ledger {
         &self.ledger
     }
@@ -215,6 +215,7 @@ impl Live {
     /// Runs one cycle: takes keyframes, trains, draws and publishes. Reopens the GPU if it fails.
     pub fn advance(&mut self) -> crate::Result<()> {
         self.apply_controls();
+        self.record_shown_pictures();
         let advanced = self
             .take_keyframes()
             .and_then(|()| self.step())
@@ -257,6 +258,15 @@ impl Live {
                         false => "this run writes no checkpoints".to_owned(),
                     });
                 }
+            }
+        }
+    }
+
+    /// Records which pictures of the first model clients have shown.
+    fn record_shown_pictures(&mut self) {
+        for picture in self.hub.take_shown_pictures() {
+            if session_for_method(&self.sessions, picture.method.as_deref()) == Some(0) {
+                self.ledger.shown(&picture);
             }
         }
     }
@@ -451,8 +461,8 @@ impl Live {
             };
             let session = &mut self.sessions[session_ix];
             let queued = session.queue_picture(&pending.request, pending.packing());
-            let n_keyframes = self.ledger.n_in_model(session.progress().step);
-            return Some(QueuedRender { pending: pending.of_keyframes(n_keyframes as u64), session_ix, queued });
+            let trained_on = self.ledger.trained_keyframes(session_ix, session.progress().step);
+            return Some(QueuedRender { pending: pending.of_keyframes(trained_on), session_ix, queued });
         }
     }
 
@@ -597,7 +607,7 @@ impl Live {
                     Some(change) => change(keyframe),
                     None => keyframe,
                 };
-                let pushed_at_step = self.sessions[0].progress().step;
+                let pushed_at_steps = self.sessions.iter().map(|session| session.progress().step).collect();
                 self.keyframes.push(keyframe.clone());
                 let mut pushed = Ok(());
                 // A model that has made all its steps gets no more keyframes, so that it equals a model trained alone.
@@ -606,9 +616,16 @@ impl Live {
                     pushed = pushed.and(session.push(&keyframe));
                 }
                 if let Some(input) = times {
-                    let (camera, stamp) = (keyframe.camera.clone(), keyframe.stamp);
-                    let pushed = Instant::now();
-                    self.ledger.push(KeyframeTimes { camera, stamp, input, pushed, pushed_at_step, trained: None });
+                    self.ledger.push(KeyframeTimes {
+                        camera: keyframe.camera.clone(),
+                        stamp: keyframe.stamp,
+                        input,
+                        pushed: Instant::now(),
+                        pushed_at_steps,
+                        trained: None,
+                        sent: None,
+                        shown: None,
+                    });
                 }
                 pushed
             }

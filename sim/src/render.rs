@@ -8,9 +8,12 @@ use crate::robot::RobotPose;
 use crate::scene::ARM_GROUP;
 use crossbeam_channel::{Receiver, Sender, bounded};
 use kinematics::Transform;
-use mujoco_rs::prelude::{MjData, MjModel, MjrContext, MjrRectangle, MjvCamera, MjvOption, MjvPerturb, MjvScene};
+use mujoco_rs::prelude::{
+    MjData, MjModel, MjrContext, MjrRectangle, MjtObj, MjtRndFlag, MjvCamera, MjvOption, MjvPerturb, MjvScene,
+};
 use mujoco_rs::wrappers::traits::ModelType;
 use nalgebra::Vector3;
+use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::thread::JoinHandle;
 
@@ -130,15 +133,7 @@ fn draw_all(
     ready: &Sender<Result<String, Error>>,
     queue: &Receiver<Job>,
 ) {
-    // SAFETY: an OpenGL context is current on this thread until after `Canvas` is dropped; only this model is drawn.
-    let mut context = unsafe { MjrContext::new(model) };
-    context.offscreen();
-    let mut canvas = Canvas {
-        scene: MjvScene::new(model, usize::try_from(model.ffi().ngeom).unwrap_or(0) + 16),
-        data: MjData::new(Arc::clone(model)),
-        context,
-        near_far_m,
-    };
+    let mut canvas = Canvas::new(current, model, near_far_m);
     // OpenGL drivers compile their shaders for the first image, which takes seconds on a busy processor. Without this
     // warm-up, cameras would send nothing for that time.
     canvas.draw(&View::warm_up());
@@ -150,7 +145,8 @@ fn draw_all(
     }
 }
 
-struct Canvas {
+/// Draws a model with the context of this thread.
+pub(crate) struct Canvas {
     scene: MjvScene,
     data: MjData<Arc<MjModel>>,
     context: MjrContext,
@@ -158,9 +154,53 @@ struct Canvas {
 }
 
 impl Canvas {
-    fn draw(&mut self, view: &View) -> Picture {
+    /// The context must outlive the canvas.
+    pub(crate) fn new(_current: &HeadlessContext, model: &Arc<MjModel>, near_far_m: [f64; 2]) -> Self {
+        // SAFETY: an OpenGL context is current on this thread until after the canvas is dropped; only this model is drawn.
+        let mut context = unsafe { MjrContext::new(model) };
+        context.offscreen();
+        Self {
+            scene: MjvScene::new(model, usize::try_from(model.ffi().ngeom).unwrap_or(0) + 16),
+            data: MjData::new(Arc::clone(model)),
+            context,
+            near_far_m,
+        }
+    }
+
+    pub(crate) fn draw(&mut self, view: &View) -> Picture {
         let mut options = MjvOption::default();
         options.geomgroup[ARM_GROUP] = view.is_robot_visible.into();
+        self.draw_with(view, &options)
+    }
+
+    /// The pixels at which MuJoCo's segmentation shows the robot; as if there was nothing else if `is_alone`.
+    pub(crate) fn robot_mask(&mut self, view: &View, is_alone: bool) -> Vec<bool> {
+        let mut options = MjvOption::default();
+        if is_alone {
+            options.geomgroup.fill(0);
+        }
+        options.geomgroup[ARM_GROUP] = 1;
+        self.set_segmentation(true);
+        let picture = self.draw_with(view, &options);
+        self.set_segmentation(false);
+        let groups = self.data.model().geom_group();
+        let is_arm = |object: i32| usize::try_from(object).is_ok_and(|ix| groups[ix] == ARM_GROUP as i32);
+        let geoms = self.scene.geoms().iter().filter(|geom| geom.objtype == MjtObj::mjOBJ_GEOM as i32);
+        let arm: BTreeSet<i32> = geoms.filter(|geom| is_arm(geom.objid)).map(|geom| geom.segid).collect();
+        // MuJoCo adds 1 to the number of each geometry; 0 is the background.
+        let number = |rgb: &[u8]| i32::from(rgb[0]) + (i32::from(rgb[1]) << 8) + (i32::from(rgb[2]) << 16);
+        picture.rgb.chunks_exact(3).map(|rgb| arm.contains(&(number(rgb) - 1))).collect()
+    }
+
+    fn set_segmentation(&mut self, is_on: bool) {
+        // SAFETY: only flags are written.
+        let scene = unsafe { self.scene.ffi_mut() };
+        for flag in [MjtRndFlag::mjRND_SEGMENT, MjtRndFlag::mjRND_IDCOLOR] {
+            scene.flags[flag as usize] = is_on.into();
+        }
+    }
+
+    fn draw_with(&mut self, view: &View, options: &MjvOption) -> Picture {
         if let Some(robot) = &view.robot {
             if let Some(joints_rad) = &robot.joints_rad {
                 self.data.qpos_mut().copy_from_slice(joints_rad.as_slice());
@@ -168,7 +208,7 @@ impl Canvas {
             set_base_pose(&mut self.data, &robot.world_from_base);
         }
         self.data.forward_kinematics();
-        self.scene.update(&mut self.data, &options, &MjvPerturb::default(), &mut MjvCamera::default());
+        self.scene.update(&mut self.data, options, &MjvPerturb::default(), &mut MjvCamera::default());
         self.set_view(view);
         self.scale_lights(view.light_frac as f32);
         let [width, height] = view.size_px;

@@ -25,9 +25,10 @@ use session::methods::{self, COUNT};
 use session::next_commands::{DataSource, quoted};
 use session::run_folder::{self, CreatedFolders};
 use session::{
-    AvailableData, Checkpoints, Clock, DecisionLog, EndingSession, Evaluator, Evaluators, FinishedModel, Limits, Live,
-    LiveOptions, ModelViewer, Pace, REALIGN, Recovery, RefineSettings, RunDescription, RunFlags, ServedModel, Session,
-    Settings, StoredKeyframes, Viewers, checkpoints, corrected_rig, methods_of, recovery, robot_meshes,
+    AvailableData, Checkpoints, Clock, DecisionLog, EndingSession, Evaluator, Evaluators, FinishedModel, Latency,
+    Limits, Live, LiveOptions, ModelViewer, Pace, REALIGN, Recovery, RefineSettings, RunDescription, RunFlags,
+    ServedModel, Session, Settings, StoredKeyframes, Viewers, checkpoints, corrected_rig, methods_of, recovery,
+    robot_meshes,
 };
 use std::collections::BTreeMap;
 use std::io::IsTerminal;
@@ -140,6 +141,9 @@ struct RunDetails {
     data_losses: Vec<String>,
     /// Estimated base pose at each station after the first.
     stations: Vec<StationReport>,
+    /// Durations from mid-exposure to the model and to viewers, by name; only for the first model.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    latencies: Vec<(String, Latency)>,
     /// Largest camera position error of a keyframe, meters; only in simulation.
     #[serde(skip_serializing_if = "Option::is_none")]
     max_position_error_m: Option<f64>,
@@ -454,6 +458,7 @@ fn save(
     let n_train = live.keyframes().iter().filter(|keyframe| keyframe.split == Split::Train).count();
     let position_error_m = max_position_error_m(live.keyframes());
     let recoverable = live.describe_recoverable();
+    let mut latencies = live.ledger().latencies();
     let (mut sessions, input_result) = live.finish();
     let input_result = match input_result {
         Ok(input_result) => input_result,
@@ -485,7 +490,7 @@ fn save(
     data_losses.extend(damage.get().cloned());
     let corrected = corrected_rigs(rig, &mut sessions, &folders);
     let stations = input_result.stations.as_ref().map_or(Vec::new(), |stations| stations.reports().to_vec());
-    let ending = |(session, out): (Session, PathBuf)| EndingSession {
+    let mut ending = |(session, out): (Session, PathBuf)| EndingSession {
         details: RunDetails {
             method: session.kind().name(),
             seed: rig.train.seed,
@@ -497,6 +502,7 @@ fn save(
             range_points: input_result.join.range_scans().map(|scan| scan.points_in_world_m.len()).sum(),
             data_losses: data_losses.clone(),
             stations: stations.clone(),
+            latencies: std::mem::take(&mut latencies),
             max_position_error_m: position_error_m,
         },
         session: if is_recorded { session } else { session.with_data(DataSource::default()) },
@@ -504,7 +510,7 @@ fn save(
     };
     let mut models = Vec::new();
     if n_train > 0 {
-        let finished = session::finish(sessions.into_iter().zip(folders).map(ending).collect());
+        let finished = session::finish(sessions.into_iter().zip(folders).map(&mut ending).collect());
         models = finished.map_err(|error| recovery::with_recoverable(error, &recoverable))?;
         if !args.json {
             print_next_commands(&models);

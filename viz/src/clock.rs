@@ -1,6 +1,6 @@
 //! The server's clock, which stamps its messages.
 
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 /// A clock that counts milliseconds since the server started.
 #[derive(Clone, Copy, Debug)]
@@ -24,5 +24,10 @@ impl ServerClock {
         let after = at.saturating_duration_since(self.started).as_secs_f64();
         let before = self.started.saturating_duration_since(at).as_secs_f64();
         (after - before) * 1e3
+    }
+
+    /// The instant of a time; `None` if it is before the server started, or not representable.
+    pub(crate) fn instant(self, millis: f64) -> Option<Instant> {
+        self.started.checked_add(Duration::try_from_secs_f64(millis * 1e-3).ok()?)
     }
 }

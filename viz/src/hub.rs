@@ -4,9 +4,10 @@ use crate::base_path::BasePath;
 use crate::chunk_list::ChunkList;
 use crate::observation_map::{ObservationMap, PackedObservations};
 use crate::picture::packing;
+use crate::picture_times::{SentPicture, ShownPicture, ShownPictures, TrainedKeyframes};
 use crate::pose::row_major;
 use crate::protocol::{Control, ProjectionMessage};
-use crate::queue::{Outgoing, Queue, RenderJob};
+use crate::queue::{DrawnPicture, Outgoing, Queue, RenderJob};
 use crate::range_scan::RangeScan;
 use crate::robot::{RobotDescription, RobotState};
 use crate::server_message::PictureHeader;
@@ -97,6 +98,7 @@ struct Shared {
     camera_corrections: Mutex<BTreeMap<Arc<str>, Transform>>,
     /// Actions that the run has not taken yet, without repetitions.
     controls: Mutex<Vec<Control>>,
+    shown_pictures: Mutex<ShownPictures>,
     /// Whether somebody besides the clients needs images and robot states.
     is_observed: AtomicBool,
     queue: Mutex<Queue>,
@@ -289,6 +291,27 @@ impl Hub {
         controls.push(action);
     }
 
+    /// The pictures of models in training that clients have shown since the last call. If it is not called for long, the
+    /// oldest are missing.
+    pub fn take_shown_pictures(&self) -> Vec<ShownPicture> {
+        self.shared.shown_pictures.lock().take()
+    }
+
+    /// Records that the server begins to send a picture to a client.
+    pub(crate) fn picture_sent(&self, client: u64, picture: SentPicture) {
+        if let Some(unreported) = self.queue().unreported(client) {
+            unreported.sent(picture);
+        }
+    }
+
+    /// Records that a client has shown a picture; does nothing if the picture is unknown.
+    pub(crate) fn picture_shown(&self, client: u64, id: u64, view: &str, shown_at: Instant) {
+        let picture = self.queue().unreported(client).and_then(|unreported| unreported.shown(id, view, shown_at));
+        if let Some(picture) = picture {
+            self.shared.shown_pictures.lock().push(picture);
+        }
+    }
+
     /// Number of connected clients.
     pub fn n_clients(&self) -> usize {
         self.queue().n_clients()
@@ -304,7 +327,7 @@ impl Hub {
             started: Instant::now(),
             hub: self.clone(),
             job,
-            n_keyframes: None,
+            trained_on: None,
             is_released: false,
         })
     }
@@ -413,7 +436,7 @@ pub struct PendingRender {
     started: Instant,
     hub: Hub,
     job: RenderJob,
-    n_keyframes: Option<u64>,
+    trained_on: Option<TrainedKeyframes>,
     is_released: bool,
 }
 
@@ -423,10 +446,10 @@ impl PendingRender {
         self.job.view_request.method.as_deref()
     }
 
-    /// Tells the client that the model contains this many keyframes, counted from the start of the run.
+    /// Sets the keyframes on which the model has been trained, of which the client is informed.
     #[must_use]
-    pub fn of_keyframes(mut self, n_keyframes: u64) -> Self {
-        self.n_keyframes = Some(n_keyframes);
+    pub fn of_keyframes(mut self, trained_on: TrainedKeyframes) -> Self {
+        self.trained_on = Some(trained_on);
         self
     }
 
@@ -444,12 +467,13 @@ impl PendingRender {
 
     /// Sends the rendered picture to the client. Encoding happens on the server's threads.
     pub fn deliver(mut self, picture: impl Into<Rendered>) {
-        let picture = picture.into();
-        let header = self.header(picture.size_px());
+        let rendered = picture.into();
+        let header = self.header(rendered.size_px());
         if header.last {
             self.hub.queue().record_render_time(&self.job, header.render_millis);
         }
-        self.enqueue_answer(Outgoing::Picture(Box::new((self.job.clone(), header, picture))));
+        let drawn = DrawnPicture { job: self.job.clone(), header, trained_on: self.trained_on, rendered };
+        self.enqueue_answer(Outgoing::Picture(Box::new(drawn)));
     }
 
     /// Sends the client a one-sentence reason why this picture could not be rendered.
@@ -482,7 +506,9 @@ impl PendingRender {
             waited_millis: (self.started - view_request.received).as_secs_f64() * 1e3,
             render_millis: self.started.elapsed().as_secs_f64() * 1e3,
             encode_millis: None,
-            keyframes: self.n_keyframes,
+            keyframes: self.trained_on.map(|trained_on| trained_on.n),
+            newest_keyframe: None,
+            sent_millis: 0.0,
             color: None,
             depth: None,
         }

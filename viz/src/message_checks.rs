@@ -1,9 +1,11 @@
 //! Checks the messages of viewers: every accepted request must be safe to render, and every accepted subscription must
 //! keep its limits. The fuzz target `page` calls it.
 
+use crate::clock::ServerClock;
 use crate::negotiation::{CAPABILITIES, negotiate};
 use crate::protocol::{
-    BASE_PROTOCOL_VERSION, ClientHello, ClientMessage, MAX_RATE_HZ, PROTOCOL_VERSION, RenderMessage, SubscribeMessage,
+    BASE_PROTOCOL_VERSION, ClientHello, ClientMessage, MAX_RATE_HZ, PROTOCOL_VERSION, RenderMessage, ShownMessage,
+    SubscribeMessage,
 };
 use crate::subscriptions::{Subscriptions, fitted};
 use crate::view_request::{MAX_SIZE_PX, ViewRequest};
@@ -17,6 +19,7 @@ pub(crate) fn check_session(session: &str) {
             Ok(ClientMessage::Hello(hello)) => check_hello(&hello),
             Ok(ClientMessage::Render(message)) => check_render(&message),
             Ok(ClientMessage::Subscribe(message)) => check_subscription(&mut subscriptions, message),
+            Ok(ClientMessage::Shown(message)) => check_shown(&message),
             Ok(ClientMessage::Control(_) | ClientMessage::Ping(_) | ClientMessage::Goodbye(_)) | Err(_) => {}
         }
     }
@@ -42,6 +45,15 @@ fn check_render(message: &RenderMessage) {
         if let Projection::Pinhole { focal_px, principal_px } = projection {
             assert!(focal_px.iter().chain(&principal_px).all(|number| number.is_finite()));
         }
+    }
+}
+
+fn check_shown(message: &ShownMessage) {
+    let clock = ServerClock::start();
+    if let Some(shown_at) = clock.instant(message.shown_millis) {
+        assert!(shown_at >= clock.instant(0.0).expect("the start"));
+        let error = (clock.millis(shown_at) - message.shown_millis).abs();
+        assert!(error <= 1e-3 + 1e-12 * message.shown_millis, "{} ms became {shown_at:?}", message.shown_millis);
     }
 }
 

@@ -3,7 +3,7 @@
 use crate::protocol::{BASE_PROTOCOL_VERSION, ClientHello, PROTOCOL_VERSION};
 
 /// Names of the capabilities of this server.
-pub(crate) const CAPABILITIES: [&str; 13] = [
+pub(crate) const CAPABILITIES: [&str; 14] = [
     "views",
     "subscribe",
     "compact_depth",
@@ -17,6 +17,7 @@ pub(crate) const CAPABILITIES: [&str; 13] = [
     "control",
     "model_chunks",
     "observations",
+    "shown",
 ];
 const KEYFRAME_CHANGES: &str = "keyframe_changes";
 const PARTS: &str = "parts";

@@ -3,8 +3,12 @@
 use crate::clock::ServerClock;
 use crate::compact_depth::{Effort, compress};
 use crate::jpeg::{Chroma, JpegError, Layout, Pixels, downscale, encode, n_threads};
+use crate::picture_times::TrainedKeyframes;
 use crate::protocol::DepthFormat;
-use crate::server_message::{BinaryHeader, ColorPart, DepthPart, LiveHeader, PictureHeader, frame};
+use crate::queue::{DrawnPicture, RenderJob};
+use crate::server_message::{
+    BinaryHeader, ColorPart, DepthPart, LiveHeader, NewestKeyframeMessage, PictureHeader, frame,
+};
 use crate::updates::{LiveImage, LivePixels};
 use crate::view_request::ViewRequest;
 use std::borrow::Cow;
@@ -42,33 +46,47 @@ pub(crate) fn packing(view_request: &ViewRequest, is_last: bool) -> Option<Packi
     (view_request.depth != Some(DepthFormat::F32)).then_some(packing)
 }
 
-/// The binary message of one rendered stage.
-pub(crate) fn pack_picture(
-    view_request: &ViewRequest,
-    mut header: PictureHeader,
-    rendered: &Rendered,
-    effort: Option<Effort>,
-) -> Result<Vec<u8>, PackError> {
+/// An encoded stage.
+pub(crate) struct PackedPicture {
+    pub(crate) job: RenderJob,
+    pub(crate) header: PictureHeader,
+    pub(crate) trained_on: Option<TrainedKeyframes>,
+    color: Vec<u8>,
+    depth: Vec<u8>,
+}
+
+impl PackedPicture {
+    /// The binary message, which is sent at this time.
+    pub(crate) fn message(&mut self, sent_at: Instant, clock: ServerClock) -> Vec<u8> {
+        let newest = self.trained_on.and_then(|trained_on| trained_on.newest);
+        self.header.newest_keyframe = newest.map(|keyframe| NewestKeyframeMessage {
+            captured_millis: clock.millis(keyframe.captured_at),
+            added_millis: clock.millis(keyframe.added_at),
+        });
+        self.header.sent_millis = clock.millis(sent_at);
+        frame(&BinaryHeader::Picture(&self.header), &[&self.color, &self.depth])
+    }
+}
+
+/// Encodes one rendered stage.
+pub(crate) fn pack_picture(drawn: DrawnPicture, effort: Option<Effort>) -> Result<PackedPicture, PackError> {
+    let DrawnPicture { job, mut header, trained_on, rendered } = drawn;
+    let view_request = &*job.view_request;
     let began = Instant::now();
-    let encoded;
     let (color, depth) = match rendered {
-        Rendered::Packed(packed) => (packed.jpeg.as_deref(), packed.depth.as_ref()),
-        Rendered::Picture(picture) => {
-            encoded = encode_picture(view_request, header.last, picture)?;
-            (encoded.0.as_deref(), encoded.1.as_ref())
-        }
+        Rendered::Packed(packed) => (packed.jpeg, packed.depth),
+        Rendered::Picture(picture) => encode_picture(view_request, header.last, &picture)?,
     };
-    let offset = color.map_or(0, <[u8]>::len);
-    header.color = color.map(|color| ColorPart { format: "jpeg", offset: 0, bytes: color.len() });
-    let compact;
+    let offset = color.as_ref().map_or(0, Vec::len);
+    header.color = color.as_ref().map(|color| ColorPart { format: "jpeg", offset: 0, bytes: color.len() });
     let format = match (view_request.depth, effort) {
         (Some(DepthFormat::CompactHalf), None) => Some(DepthFormat::U16Half),
         (requested, _) => requested,
     };
-    let depth_bytes = match depth.zip(format) {
-        None => &[][..],
+    let depth = match depth.zip(format) {
+        None => Vec::new(),
         Some((packed, format @ DepthFormat::CompactHalf)) => {
-            compact = compress(packed, effort.unwrap_or(Effort::Fast))?;
+            let compact = compress(&packed, effort.unwrap_or(Effort::Fast))?;
             header.depth = Some(DepthPart {
                 format,
                 size_px: compact.size_px,
@@ -78,7 +96,7 @@ pub(crate) fn pack_picture(
                 offset,
                 bytes: compact.bytes.len(),
             });
-            &compact.bytes
+            compact.bytes
         }
         Some((packed, format @ (DepthFormat::U16Half | DepthFormat::F32))) => {
             header.depth = Some(DepthPart {
@@ -90,11 +108,11 @@ pub(crate) fn pack_picture(
                 offset,
                 bytes: packed.counts.len(),
             });
-            &packed.counts
+            packed.counts
         }
     };
     header.encode_millis = Some(began.elapsed().as_secs_f64() * 1e3);
-    Ok(frame(&BinaryHeader::Picture(&header), &[color.unwrap_or_default(), depth_bytes]))
+    Ok(PackedPicture { job, header, trained_on, color: color.unwrap_or_default(), depth })
 }
 
 /// Encodes the requested color and depth of a picture.

@@ -31,6 +31,8 @@ pub(crate) enum ClientMessage {
     Subscribe(SubscribeMessage),
     /// Controls the run.
     Control(ControlMessage),
+    /// Reports when a picture was shown.
+    Shown(ShownMessage),
     /// Requests the server's time.
     Ping(ClientPing),
     /// The client disconnects.
@@ -41,7 +43,12 @@ impl ClientMessage {
     /// The role that a client needs to send this message. Whatever changes the run requires an operator.
     pub(crate) fn required_role(&self) -> Role {
         match self {
-            Self::Hello(_) | Self::Render(_) | Self::Subscribe(_) | Self::Ping(_) | Self::Goodbye(_) => Role::Viewer,
+            Self::Hello(_)
+            | Self::Render(_)
+            | Self::Subscribe(_)
+            | Self::Shown(_)
+            | Self::Ping(_)
+            | Self::Goodbye(_) => Role::Viewer,
             Self::Control(_) => Role::Operator,
         }
     }
@@ -119,6 +126,18 @@ pub enum Control {
     Resume,
     /// Writes a checkpoint.
     Save,
+}
+
+/// Fields of `shown`.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct ShownMessage {
+    /// Number of the request.
+    pub(crate) id: u64,
+    /// View of the request.
+    pub(crate) view: Option<String>,
+    /// When its last stage was shown, on the server's clock.
+    pub(crate) shown_millis: f64,
 }
 
 /// Fields of `ping`.

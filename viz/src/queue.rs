@@ -1,6 +1,7 @@
 //! Render requests by client and view: the newest request of each view, stage by stage. Clients take turns, and so do
 //! the views of a client.
 
+use crate::picture_times::{TrainedKeyframes, UnreportedPictures};
 use crate::server_message::PictureHeader;
 use crate::view_request::ViewRequest;
 use std::collections::{BTreeMap, VecDeque};
@@ -33,6 +34,7 @@ struct ClientQueue {
     last_served: Arc<str>,
     n_unsent: usize,
     outbox: VecDeque<Outgoing>,
+    unreported: UnreportedPictures,
     wake: Arc<Notify>,
 }
 
@@ -66,10 +68,21 @@ pub(crate) struct RenderJob {
 /// A result to send to a client.
 #[derive(Debug)]
 pub(crate) enum Outgoing {
-    /// A rendered stage that is not encoded yet. The header does not yet describe the parts of the payload.
-    Picture(Box<(RenderJob, PictureHeader, Rendered)>),
+    /// A rendered stage that is not encoded yet.
+    Picture(Box<DrawnPicture>),
     /// A stage that could not be rendered.
     Failed { id: u64, view: Arc<str>, reason: String },
+}
+
+/// A rendered stage.
+#[derive(Debug)]
+pub(crate) struct DrawnPicture {
+    pub(crate) job: RenderJob,
+    /// The header, which does not yet describe the payload.
+    pub(crate) header: PictureHeader,
+    /// The keyframes in the model, in a live run.
+    pub(crate) trained_on: Option<TrainedKeyframes>,
+    pub(crate) rendered: Rendered,
 }
 
 impl Queue {
@@ -145,6 +158,11 @@ impl Queue {
     /// Takes the oldest result from a client's outbox.
     pub(crate) fn collect(&mut self, client: u64) -> Option<Outgoing> {
         self.clients.get_mut(&client)?.outbox.pop_front()
+    }
+
+    /// The pictures that were sent to a client and that it has not reported as shown.
+    pub(crate) fn unreported(&mut self, client: u64) -> Option<&mut UnreportedPictures> {
+        self.clients.get_mut(&client).map(|waiting| &mut waiting.unreported)
     }
 
     /// Records that a stage was sent or will never be rendered.

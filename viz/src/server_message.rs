@@ -198,8 +198,17 @@ pub(crate) struct PictureHeader {
     pub(crate) render_millis: f64,
     pub(crate) encode_millis: Option<f64>,
     pub(crate) keyframes: Option<u64>,
+    pub(crate) newest_keyframe: Option<NewestKeyframeMessage>,
+    pub(crate) sent_millis: f64,
     pub(crate) color: Option<ColorPart>,
     pub(crate) depth: Option<DepthPart>,
+}
+
+/// Times of the keyframe that was added last to the model of a picture, on the server's clock.
+#[derive(Debug, Serialize)]
+pub(crate) struct NewestKeyframeMessage {
+    pub(crate) captured_millis: f64,
+    pub(crate) added_millis: f64,
 }
 
 /// Position of the color in the payload.

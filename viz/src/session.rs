@@ -3,10 +3,11 @@
 use crate::Hub;
 use crate::access::Role;
 use crate::admission::Connection;
+use crate::clock::ServerClock;
 use crate::hub::Demand;
 use crate::link_rate::LinkRate;
 use crate::negotiation::{Negotiated, negotiate};
-use crate::protocol::{ClientMessage, ControlMessage, SubscribeMessage};
+use crate::protocol::{ClientMessage, ControlMessage, ShownMessage, SubscribeMessage};
 use crate::queue::MAX_VIEWS;
 use crate::server_context::ServerContext;
 use crate::view_request::{InvalidRequest, ViewRequest};
@@ -33,6 +34,7 @@ pub(crate) async fn serve(socket: WebSocket, connection: Arc<Connection>, role: 
     let reader = Reader {
         stream,
         hub: &server_context.hub,
+        clock: server_context.clock,
         client,
         role,
         connection: &connection,
@@ -74,6 +76,7 @@ impl Drop for ClientGuard<'_> {
 struct Reader<'a> {
     stream: SplitStream<WebSocket>,
     hub: &'a Hub,
+    clock: ServerClock,
     client: u64,
     role: Role,
     connection: &'a Connection,
@@ -145,6 +148,12 @@ impl Reader<'_> {
             ClientMessage::Control(ControlMessage { action }) => {
                 log::info!("client {}: {action:?}", self.client);
                 self.hub.control(action);
+                None
+            }
+            ClientMessage::Shown(ShownMessage { id, view, shown_millis }) => {
+                let shown_at = self.clock.instant(shown_millis);
+                let shown_at = shown_at.ok_or(InvalidRequest::ShownTime { got: shown_millis })?;
+                self.hub.picture_shown(self.client, id, view.as_deref().unwrap_or_default(), shown_at);
                 None
             }
             ClientMessage::Ping(ping) => Some(Reply::Pong { t: ping.t }),

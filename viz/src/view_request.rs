@@ -52,6 +52,8 @@ pub(crate) enum InvalidRequest {
     ViewName { got: usize },
     #[error("{max} views have pending requests, which is the maximum; wait for a picture of one of them")]
     Views { max: usize },
+    #[error("shown_millis is {got}, expected a time of the server's clock, 0 or more")]
+    ShownTime { got: f64 },
     #[error("rate_hz is {got}, expected 0 to {max}", max = crate::protocol::MAX_RATE_HZ)]
     Rate { got: f64 },
     #[error("camera and size_px apply only to the topic live_images")]

@@ -11,12 +11,13 @@ use crate::compact_depth::Effort;
 use crate::hub::Demand;
 use crate::link_rate::LinkRate;
 use crate::negotiation::{Agreement, CAPABILITIES, Negotiated};
-use crate::picture::{PackError, pack_picture};
+use crate::picture::{PackError, PackedPicture, pack_picture};
+use crate::picture_times::SentPicture;
 use crate::protocol::{BASE_PROTOCOL_VERSION, PROTOCOL_VERSION};
-use crate::queue::{Outgoing, RenderJob};
+use crate::queue::{DrawnPicture, Outgoing};
 use crate::robot::RobotStateMessage;
 use crate::server_context::ServerContext;
-use crate::server_message::{BinaryHeader, PartHeader, PictureHeader, ServerMessage, frame};
+use crate::server_message::{BinaryHeader, PartHeader, ServerMessage, frame};
 use crate::view_request::{DEFAULT_STAGES, MAX_SIZE_PX};
 use axum::body::Bytes;
 use axum::extract::ws::{Message, WebSocket};
@@ -28,7 +29,6 @@ use std::time::{Duration, Instant};
 use tokio::sync::{Notify, mpsc, watch};
 use tokio::task::{JoinError, JoinHandle};
 use tokio::time::MissedTickBehavior;
-use trainer::Rendered;
 
 /// Period of heartbeats; short enough for pages to detect silence quickly.
 const HEARTBEAT_PERIOD: Duration = Duration::from_millis(250);
@@ -68,7 +68,7 @@ pub(crate) struct Writer<'a> {
 struct EncodingTask {
     id: u64,
     view: Arc<str>,
-    task: JoinHandle<Result<Vec<u8>, PackError>>,
+    task: JoinHandle<Result<PackedPicture, PackError>>,
 }
 
 /// A binary message that is being sent in parts.
@@ -80,7 +80,7 @@ struct Transfer {
 }
 
 /// An encoded picture, or the reason why there is none.
-type EncodingResult = Result<Result<Vec<u8>, PackError>, JoinError>;
+type EncodingResult = Result<Result<PackedPicture, PackError>, JoinError>;
 
 impl Writer<'_> {
     /// Sends until the connection fails or a goodbye is sent.
@@ -119,8 +119,8 @@ impl Writer<'_> {
                 && let Some(outgoing) = self.server_context.hub.collect(self.client)
             {
                 match outgoing {
-                    Outgoing::Picture(rendered) => {
-                        encoding = Some(encode(rendered, self.link.effort(self.connection.is_loopback())))
+                    Outgoing::Picture(drawn) => {
+                        encoding = Some(encode(drawn, self.link.effort(self.connection.is_loopback())))
                     }
                     Outgoing::Failed { id, view, reason } => {
                         let sent = self.send_error(Some(id), &view, &reason).await;
@@ -201,8 +201,8 @@ impl Writer<'_> {
                 encoded = finished(&mut encoding), if transfer.is_none() => {
                     let Some(EncodingTask { id, view, .. }) = encoding.take() else { continue };
                     let reason = match encoded {
-                        Ok(Ok(bytes)) => {
-                            transfer = start_transfer(bytes.into(), true);
+                        Ok(Ok(packed)) => {
+                            transfer = start_transfer(self.message_of(packed).into(), true);
                             continue;
                         }
                         Ok(Err(error)) => error.to_string(),
@@ -218,6 +218,19 @@ impl Writer<'_> {
                 () = sleep_until(update_due) => {}
             }
         }
+    }
+
+    /// The message of a picture that is about to be sent.
+    fn message_of(&self, mut packed: PackedPicture) -> Vec<u8> {
+        let sent_at = Instant::now();
+        let message = packed.message(sent_at, self.server_context.clock);
+        if let Some(trained_on) = packed.trained_on.filter(|_| packed.header.last) {
+            let request = &packed.job.view_request;
+            let (id, view, method) = (request.id, Arc::clone(&request.view), request.method.clone());
+            let picture = SentPicture { id, view, method, n_keyframes: trained_on.n, sent_at };
+            self.server_context.hub.picture_sent(self.client, picture);
+        }
+        message
     }
 
     async fn send_hello(&mut self) -> SessionFlow {
@@ -307,13 +320,10 @@ impl Writer<'_> {
     }
 }
 
-fn encode(rendered: Box<(RenderJob, PictureHeader, Rendered)>, effort: Option<Effort>) -> EncodingTask {
-    let view_request = &rendered.0.view_request;
+fn encode(drawn: Box<DrawnPicture>, effort: Option<Effort>) -> EncodingTask {
+    let view_request = &drawn.job.view_request;
     let (id, view) = (view_request.id, Arc::clone(&view_request.view));
-    let task = tokio::task::spawn_blocking(move || {
-        let (job, header, picture) = *rendered;
-        pack_picture(&job.view_request, header, &picture, effort)
-    });
+    let task = tokio::task::spawn_blocking(move || pack_picture(*drawn, effort));
     EncodingTask { id, view, task }
 }
 

@@ -2,10 +2,15 @@
 
 mod tls;
 
+use kinematics::random::Random;
+use rustix::net::sockopt::set_socket_recv_buffer_size;
+use rustix::net::{AddressFamily, SocketType, connect, socket};
 use serde_json::{Value, json};
 use std::io::{Read, Write};
 use std::net::{SocketAddr, TcpStream};
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
+use trainer::Picture;
 use tungstenite::client::IntoClientRequest;
 use tungstenite::{Message, WebSocket};
 use viz::{Certificate, Control, Hub, Server, ServerConfig, Sharing, Tokens};
@@ -16,6 +21,10 @@ const TIMEOUT: Duration = Duration::from_secs(20);
 const HANDSHAKE_SECS: std::ops::Range<f64> = 2.0..8.0;
 /// A new viewer connects within this time, regardless of other connections.
 const VIEWER_TIMEOUT: Duration = Duration::from_secs(1);
+
+/// Receive buffer of a slow client. It is set before the connection is opened. Otherwise, the kernel sends segments of 64 kB
+/// over loopback, in bursts that no other link has.
+const RECEIVE_BUFFER_BYTES: usize = 8192;
 
 /// A shared server and what its users know.
 struct Shared {
@@ -59,11 +68,17 @@ impl Shared {
     }
 
     fn client(&self, token: &str) -> Client {
+        Client(self.websocket(self.tls(), token))
+    }
+
+    /// Opens a WebSocket over a TLS connection.
+    fn websocket<S: Read + Write>(&self, stream: S, token: &str) -> WebSocket<S> {
         let mut request = format!("wss://{}/ws", self.address()).into_client_request().expect("a request");
         let headers = request.headers_mut();
         headers.insert("authorization", format!("Bearer {token}").parse().expect("text"));
         headers.insert("origin", format!("https://{}", self.address()).parse().expect("text"));
-        Client(tungstenite::client(request, self.tls()).expect("a WebSocket").0)
+        let Ok((socket, _)) = tungstenite::client(request, stream) else { panic!("no WebSocket") };
+        socket
     }
 
     /// A connection on which a WebSocket is open, for invalid frames.
@@ -267,4 +282,135 @@ fn hostile_clients_are_closed_and_others_unharmed() {
     stream.write_all(&[7; 40_000]).expect("sent");
     assert!(secs_until_closed(stream) < 5.0);
     assert!(operator.is_answered());
+}
+
+/// Reads at a limited rate.
+struct Slow {
+    stream: TcpStream,
+    bytes_per_sec: f64,
+}
+
+impl Slow {
+    fn connect(address: SocketAddr, bytes_per_sec: f64) -> Self {
+        let socket = socket(AddressFamily::INET, SocketType::STREAM, None).expect("a socket");
+        set_socket_recv_buffer_size(&socket, RECEIVE_BUFFER_BYTES).expect("a small buffer");
+        connect(&socket, &address).expect("the server listens");
+        let stream = TcpStream::from(socket);
+        stream.set_read_timeout(Some(TIMEOUT)).expect("a timeout");
+        Self { stream, bytes_per_sec }
+    }
+}
+
+impl Read for Slow {
+    fn read(&mut self, bytes: &mut [u8]) -> std::io::Result<usize> {
+        let n_max = bytes.len().min(4096);
+        let n = self.stream.read(&mut bytes[..n_max])?;
+        std::thread::sleep(Duration::from_secs_f64(n as f64 / self.bytes_per_sec));
+        Ok(n)
+    }
+}
+
+impl Write for Slow {
+    fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
+        self.stream.write(bytes)
+    }
+
+    fn flush(&mut self) -> std::io::Result<()> {
+        self.stream.flush()
+    }
+}
+
+/// A picture that cannot be compressed, so that it takes long to send.
+fn noise() -> Picture {
+    let size_px = [1280, 720];
+    let mut random = Random::new(5);
+    let n = (size_px[0] * size_px[1]) as usize;
+    let rgba_srgb = (0..4 * n).map(|_| u8::try_from(random.below(256)).expect("a byte")).collect();
+    Picture { size_px, rgba_srgb, depth_m: vec![1.0; n] }
+}
+
+/// Times for which the answers to pings wait on the server, while pictures are sent at this rate.
+fn waits_during_pictures<S: Read + Write>(
+    mut socket: WebSocket<S>,
+    slow: impl Fn(&S) -> &Slow,
+    bytes_per_sec: f64,
+) -> Vec<Duration> {
+    /// Pings, and how many of them are sent while the server still measures the connection.
+    const N_PINGS: usize = 25;
+    const N_FIRST: usize = 10;
+    let send = |socket: &mut WebSocket<_>, message: Value| {
+        socket.send(Message::text(message.to_string())).expect("sent");
+    };
+    send(&mut socket, json!({"type": "hello", "protocols": [3, 4], "capabilities": ["parts"]}));
+    let mut waits = Vec::new();
+    let mut is_sending_pictures = false;
+    while waits.len() < N_PINGS {
+        let asked = Instant::now();
+        // What this end has received but not read has left the server.
+        let n_unread = rustix::io::ioctl_fionread(&slow(socket.get_ref()).stream).expect("a number of bytes");
+        let reading = Duration::from_secs_f64(n_unread as f64 / bytes_per_sec);
+        send(&mut socket, json!({"type": "ping", "t": 7}));
+        send(
+            &mut socket,
+            json!({
+                "type": "render", "id": waits.len(), "size_px": [1280, 720], "stages": [1.0],
+                "world_from_camera": [1, 0, 0, 0.0, 0, 0, 1, -2.0, 0, -1, 0, 0.5, 0, 0, 0, 1],
+                "projection": {"kind": "pinhole", "vertical_fov_rad": 0.9}, "outputs": ["color", "depth"],
+                "depth_format": "f32",
+            }),
+        );
+        // Continues to read, so that pictures are sent all the time.
+        let mut answered = None;
+        while answered.is_none() || asked.elapsed() < Duration::from_millis(150) {
+            match socket.read().expect("a message") {
+                Message::Text(text) if text.contains("\"pong\"") => answered = Some(asked.elapsed()),
+                Message::Binary(_) => is_sending_pictures = true,
+                _ => {}
+            }
+        }
+        waits.extend(answered.filter(|_| is_sending_pictures).map(|wait| wait.saturating_sub(reading)));
+    }
+    waits.split_off(N_FIRST)
+}
+
+/// With TLS as without, little data waits on the server.
+#[test]
+fn replies_do_not_wait_for_pictures_with_tls() {
+    /// 100 ms of unsent data, and scheduling on two busy cores. The median, because other tests run beside this one; data
+    /// that waits on the server delays all replies.
+    const MAX_MEDIAN: Duration = Duration::from_millis(100 + 50);
+    let shared = Shared::start();
+    let config = ServerConfig { listen: ([127, 0, 0, 1], 0).into() };
+    let local = Server::start(config, shared.hub.clone()).expect("a free port exists");
+    let is_over = AtomicBool::new(false);
+    std::thread::scope(|scope| {
+        scope.spawn(|| {
+            let picture = noise();
+            while !is_over.load(Ordering::Relaxed) {
+                shared.hub.wait_for_request(Duration::from_millis(50));
+                if let Some(pending) = shared.hub.next_request() {
+                    pending.deliver(picture.clone());
+                }
+            }
+        });
+        let measured = [2.5e5, 6.25e5, 2.5e6].map(|bytes_per_sec| {
+            let stream = tls::over(Slow::connect(shared.address(), bytes_per_sec), &shared.fingerprint);
+            let socket = shared.websocket(stream, &shared.viewer);
+            let with_tls = waits_during_pictures(socket, |stream| &stream.sock, bytes_per_sec);
+            let stream = Slow::connect(local.address(), bytes_per_sec);
+            let Ok((socket, _)) = tungstenite::client(format!("ws://{}/ws", local.address()), stream) else {
+                panic!("no WebSocket")
+            };
+            (bytes_per_sec, with_tls, waits_during_pictures(socket, |stream| stream, bytes_per_sec))
+        });
+        is_over.store(true, Ordering::Relaxed);
+        for (bytes_per_sec, with_tls, without_tls) in measured {
+            for (name, mut waits) in [("with TLS", with_tls), ("without TLS", without_tls)] {
+                waits.sort();
+                let (median, longest) = (waits[waits.len() / 2], waits[waits.len() - 1]);
+                eprintln!("{} Mbit/s {name}: median {median:?}, longest {longest:?}", bytes_per_sec * 8e-6);
+                assert!(median < MAX_MEDIAN, "at {bytes_per_sec} bytes/s {name}: {waits:?}");
+            }
+        }
+    });
 }

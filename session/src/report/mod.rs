@@ -60,6 +60,7 @@ impl Page<'_> {
         page.push_str(&curve(report, method));
         page.push_str(&collapsible(&scores_of_images(report), "Scores of all test images"));
         page.push_str(&collapsible(&evaluations_table(report, self.primitive), "Scores during training"));
+        page.push_str(&collapsible(&latencies(&report["latencies"]), "Latency"));
         page.push_str(&trials(&report["trials"]));
         page.push_str(&self.settings_tables());
         page.push_str("</main></body></html>\n");
@@ -74,7 +75,7 @@ impl Page<'_> {
     }
 
     fn settings_tables(&self) -> String {
-        let excluded_keys = ["done", "data_losses", "evaluations", "trials", "passes", "per_image"];
+        let excluded_keys = ["done", "data_losses", "evaluations", "latencies", "trials", "passes", "per_image"];
         let extra = self.report.as_object().into_iter().flatten();
         let extra = extra.filter(|(key, _)| !excluded_keys.contains(&key.as_str()));
         let mut run: Vec<Vec<String>> = vec![vec!["command".to_owned(), self.command.clone()]];
@@ -297,6 +298,17 @@ fn collapsible(table: &Table, title: &str) -> String {
     }
 }
 
+/// Durations of a live run.
+fn latencies(latencies: &Value) -> Table {
+    let row = |latency: &Value| {
+        let [name, values] = latency.as_array()?.as_slice() else { return None };
+        let millis = |key: &str| values[key].as_f64().map_or("–".to_owned(), |millis| format!("{millis:.0}"));
+        Some(vec![text_of(name), millis("p50"), millis("p99"), text_of(&values["n"])])
+    };
+    let head = ["duration", "median, ms", "99 %, ms", "keyframes"].map(str::to_owned).to_vec();
+    Table { title: "Latency".into(), head, rows: array(latencies).iter().filter_map(row).collect() }
+}
+
 /// The results of A/B trials.
 fn trials(trials: &Value) -> String {
     let rows: Vec<Vec<String>> = array(trials)
@@ -439,6 +451,7 @@ mod tests {
             "per_image": [{ "name": "images/1.jpg", "psnr": 23.456, "ssim": null }],
             "trials": [{ "candidate": "joints", "gain_db": 0.5, "standard_error_db": 0.1, "n_images": 9, "kept": true }],
             "rejected": { "blurred": 3 }, "alignment": null,
+            "latencies": [["shutter to shown", { "p50": 181.7, "p99": 640.2, "n": 95 }]],
         }));
         for words in [
             "<title>runs/a &lt;b&gt;: splat</title>",
@@ -451,6 +464,7 @@ mod tests {
             "<svg ",
             "images/1.jpg",
             "+0.50 ± 0.10",
+            "<td>shutter to shown</td><td>182</td><td>640</td><td>95</td>",
             "<td>rejected: blurred</td><td>3</td>",
             "<td>options: seed</td><td>7</td>",
             "prefers-color-scheme: dark",

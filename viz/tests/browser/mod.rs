@@ -11,6 +11,9 @@ use tungstenite::{Message, WebSocket};
 /// Far more than a browser needs on two busy cores.
 const TIMEOUT: Duration = Duration::from_secs(60);
 
+/// A script for [`Browser::open_with`] that replaces WebGL, because drawing on the CPU takes most of the time.
+pub(crate) const WEBGL_STUB: &str = include_str!("webgl_stub.js");
+
 /// A running browser with one page.
 pub(crate) struct Browser {
     process: Child,
@@ -21,12 +24,18 @@ pub(crate) struct Browser {
 
 /// Path of a browser for tests of the page; `None`, with a message, if Chromium or the bundled page is missing.
 pub(crate) fn browser_for_page() -> Option<PathBuf> {
-    let bundle = Path::new(env!("CARGO_MANIFEST_DIR")).join("web/dist/app.js");
-    let browser = chromium().filter(|_| bundle.is_file());
+    let browser = chromium().filter(|_| bundle().join("app.js").is_file());
     if browser.is_none() {
         eprintln!("page test skipped: it needs Chromium and the bundled page (make web)");
     }
     browser
+}
+
+/// Folder of the bundled page. Tests of this crate and of the workspace's root use it.
+pub(crate) fn bundle() -> PathBuf {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let viz = if root.join("viz").is_dir() { root.join("viz") } else { root.to_owned() };
+    viz.join("web/dist")
 }
 
 /// Path of Chromium, if it is installed.
@@ -35,6 +44,15 @@ fn chromium() -> Option<PathBuf> {
     let folders: Vec<PathBuf> = std::env::split_paths(&std::env::var_os("PATH")?).collect();
     let paths = names.iter().flat_map(|name| folders.iter().map(move |folder| folder.join(name)));
     paths.into_iter().find(|path| path.is_file())
+}
+
+/// A task of the main thread.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Task {
+    /// Duration, milliseconds.
+    pub(crate) millis: f64,
+    /// CPU time, milliseconds: without the time for which other programs used the core.
+    pub(crate) cpu_millis: f64,
 }
 
 impl Browser {
@@ -140,8 +158,8 @@ impl Browser {
         self.call("Input.dispatchMouseEvent", event);
     }
 
-    /// Durations of the tasks of the page's main thread within this time, milliseconds.
-    pub(crate) fn trace_tasks(&mut self, duration: Duration) -> Vec<f64> {
+    /// The tasks of the page's main thread within this time.
+    pub(crate) fn trace_tasks(&mut self, duration: Duration) -> Vec<Task> {
         let session = std::mem::take(&mut self.session); // Tracing belongs to the browser, not to the page.
         self.call("Tracing.start", json!({"traceConfig": {"includedCategories": ["toplevel"]}}));
         std::thread::sleep(duration);
@@ -164,7 +182,10 @@ impl Browser {
         let is_task = |event: &&Value| {
             event["name"] == "ThreadControllerImpl::RunTask" && main_threads.contains(&(&event["pid"], &event["tid"]))
         };
-        events.iter().filter(is_task).filter_map(|event| Some(event["dur"].as_f64()? * 1e-3)).collect()
+        let task = |event: &Value| {
+            Some(Task { millis: event["dur"].as_f64()? * 1e-3, cpu_millis: event["tdur"].as_f64()? * 1e-3 })
+        };
+        events.iter().filter(is_task).filter_map(task).collect()
     }
 
     /// Screenshot of the page as PNG.

@@ -5,6 +5,7 @@ use rustls::crypto::{CryptoProvider, ring, verify_tls13_signature};
 use rustls::pki_types::{CertificateDer, ServerName, UnixTime};
 use rustls::{ClientConfig, ClientConnection, DigitallySignedStruct, SignatureScheme, StreamOwned};
 use sha2::{Digest, Sha256};
+use std::io::{Read, Write};
 use std::net::{SocketAddr, TcpStream};
 use std::sync::Arc;
 
@@ -18,7 +19,7 @@ pub(crate) fn connect(address: SocketAddr, fingerprint: &str) -> TlsStream {
 }
 
 /// TLS over this connection.
-pub(crate) fn over(stream: TcpStream, fingerprint: &str) -> TlsStream {
+pub(crate) fn over<S: Read + Write>(stream: S, fingerprint: &str) -> StreamOwned<ClientConnection, S> {
     let provider = Arc::new(ring::default_provider());
     let verifier = Pinned { fingerprint: fingerprint.to_owned(), provider: Arc::clone(&provider) };
     let config = ClientConfig::builder_with_provider(provider)

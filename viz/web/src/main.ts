@@ -18,6 +18,7 @@ import { Readouts } from "./readouts";
 import { RenderScheduler } from "./render_scheduler";
 import { RobotAge } from "./robot_age";
 import { RunControls } from "./run_controls";
+import { ShownLatency } from "./shown_latency";
 import { Subscriptions } from "./subscriptions";
 import { ViewSettings } from "./view_settings";
 
@@ -63,6 +64,7 @@ const connection = new Connection(`${location.protocol === "https:" ? "wss" : "w
       liveImages.forget();
       robotAge.forget();
       scheduler.restart();
+      shownLatency.forget();
       view.points.clear();
       view.scans.clear();
       view.scans.setPath([]);
@@ -83,7 +85,9 @@ const subscriptions = new Subscriptions(connection, liveImages);
 const keyframes = new KeyframeList();
 const runControls = new RunControls(connection);
 new LinkReadout(connection);
+const shownLatency = new ShownLatency(connection);
 const models = new ModelSwitch(() => {
+  shownLatency.forget();
   scheduler.restart();
   if (latestStatus) showStatus(latestStatus);
 });
@@ -200,6 +204,7 @@ function receiveBinary(header: BinaryHeader, payload: Uint8Array<ArrayBuffer>): 
 
 async function showPicture(header: PictureHeader, payload: Uint8Array<ArrayBuffer>): Promise<void> {
   const millis = scheduler.answered(header);
+  const receivedAt = performance.now();
   try {
     if (!(await view.picture.show(header, payload, view.emptyDepth))) return;
   } catch (error) {
@@ -207,6 +212,8 @@ async function showPicture(header: PictureHeader, payload: Uint8Array<ArrayBuffe
     element("notice").textContent = `Cannot show a picture: ${error instanceof Error ? error.message : String(error)}`;
     return;
   }
+  if (header.color && showsModel) shownLatency.pictureReady(header, receivedAt);
+  else shownLatency.restart();
   view.changed();
   element("notice").textContent = "";
   if (!header.color) return;
@@ -292,6 +299,7 @@ toggle("toggle-robot", "b", (isOn) => (view.robot.enabled = isOn));
 toggle("toggle-occlude", "o", (isOn) => (view.occlusion.enabled = isOn));
 
 function frame(): void {
+  shownLatency.frameBegins();
   settings.tick();
   scheduler.tick();
   view.draw();

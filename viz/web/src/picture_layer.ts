@@ -53,6 +53,15 @@ const FRAGMENT = /* glsl */ `${TINT}
     gl_FragColor = vec4(tinted(texture2D(colorMap, uv).rgb, pointInWorld), opacity);
   }`;
 
+/** A picture that has been received, and what becomes of it: whether it is shown. */
+interface Received {
+  header: PictureHeader;
+  payload: Uint8Array<ArrayBuffer>;
+  emptyDepth: number;
+  resolve: (isShown: boolean) => void;
+  reject: (reason: unknown) => void;
+}
+
 export class PictureLayer {
   readonly mesh: THREE.Mesh<THREE.BufferGeometry, THREE.ShaderMaterial>;
   /** The depth of the shown picture. */
@@ -61,6 +70,10 @@ export class PictureLayer {
   /** Whether the newest picture has colors. */
   private hasColor = false;
   private shown: { id: number; stage: number } | null = null;
+  private waiting: Received | null = null;
+  private isDecoding = false;
+  /** Number of servers so far. */
+  private nServers = 0;
 
   constructor(
     private readonly occlusion: Occlusion,
@@ -107,14 +120,42 @@ export class PictureLayer {
     uniforms.isMoved!.value = worldFromView.elements.some((value, ix) => Math.abs(value - picture[ix]!) > 1e-4);
   }
 
-  /** Shows a picture unless a newer one is already shown. Returns whether it did. A picture may consist of depth only. */
-  async show(header: PictureHeader, payload: Uint8Array<ArrayBuffer>, emptyDepth: number): Promise<boolean> {
+  /**
+   * Shows a picture, unless a newer one arrives while an older one is decoded. Returns whether it did. A picture may
+   * consist of depth only.
+   */
+  show(header: PictureHeader, payload: Uint8Array<ArrayBuffer>, emptyDepth: number): Promise<boolean> {
+    return new Promise((resolve, reject) => {
+      this.waiting?.resolve(false);
+      this.waiting = { header, payload, emptyDepth, resolve, reject };
+      if (!this.isDecoding) void this.decodeWaiting();
+    });
+  }
+
+  private async decodeWaiting(): Promise<void> {
+    this.isDecoding = true;
+    for (let next = this.waiting; next; next = this.waiting) {
+      this.waiting = null;
+      await this.decode(next.header, next.payload, next.emptyDepth).then(next.resolve, next.reject);
+    }
+    this.isDecoding = false;
+  }
+
+  private async decode(
+    header: PictureHeader,
+    payload: Uint8Array<ArrayBuffer>,
+    emptyDepth: number,
+  ): Promise<boolean> {
     if (header.projection.kind !== "pinhole") return false;
+    const server = this.nServers;
     const [bitmap, depth] = await Promise.all([
       header.color ? unpackColor(header.color, payload) : null,
       unpackDepth(header.depth, payload),
     ]);
-    if (this.shown && (this.shown.id > header.id || (this.shown.id === header.id && this.shown.stage > header.stage))) {
+    const isOlder =
+      this.shown &&
+      (this.shown.id > header.id || (this.shown.id === header.id && this.shown.stage > header.stage));
+    if (isOlder || server !== this.nServers) {
       bitmap?.close();
       return false;
     }
@@ -144,8 +185,11 @@ export class PictureLayer {
     return true;
   }
 
-  /** Resets the numbering, because a new server counts from the start. */
+  /** Resets the numbering, because a new server counts from the start. Pictures of the old server are not shown. */
   forget(): void {
+    this.nServers += 1;
+    this.waiting?.resolve(false);
+    this.waiting = null;
     this.shown = null;
   }
 }

@@ -19,6 +19,7 @@ export const CAPABILITIES = [
   "control",
   "model_chunks",
   "observations",
+  "shown",
 ] as const;
 export type Capability = (typeof CAPABILITIES)[number];
 
@@ -217,6 +218,9 @@ export interface PictureHeader {
   render_millis: number;
   encode_millis: number | null;
   keyframes: number | null;
+  /** Times of the keyframe that was added last to the model, on the server's clock; missing on older servers. */
+  newest_keyframe: { captured_millis: number; added_millis: number } | null | undefined;
+  sent_millis: number;
   color: { format: "jpeg"; offset: number; bytes: number } | null;
   depth: DepthPart | null;
 }
@@ -393,12 +397,24 @@ export interface RenderMessage {
   background_srgb: [number, number, number];
 }
 
+export interface ShownMessage {
+  type: "shown";
+  id: number;
+  shown_millis: number;
+}
+
 export interface PingMessage {
   type: "ping";
   t: number;
 }
 
-export type ClientMessage = HelloMessage | RenderMessage | SubscribeMessage | ControlMessage | PingMessage;
+export type ClientMessage =
+  | HelloMessage
+  | RenderMessage
+  | SubscribeMessage
+  | ControlMessage
+  | ShownMessage
+  | PingMessage;
 
 /** Header and payload of a binary message: u32 little-endian header length, JSON header, payload. */
 export function unframe(message: ArrayBuffer): {

@@ -28,8 +28,13 @@ export class ServerClock {
 
   /** Upper bound on the age of an event, milliseconds; null until the server has answered a ping. */
   age(clockMillis: number): number | null {
+    const now = this.serverMillis(performance.now());
+    return now === null ? null : now - clockMillis;
+  }
+
+  /** Upper bound on the server's clock at a time of this page; null until the server has answered a ping. */
+  serverMillis(pageMillis: number): number | null {
     if (this.samples.length === 0) return null;
-    const ahead = Math.min(...this.samples.map((sample) => sample.ahead));
-    return performance.now() + ahead - clockMillis;
+    return pageMillis + Math.min(...this.samples.map((sample) => sample.ahead));
   }
 }
