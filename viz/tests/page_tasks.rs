@@ -9,7 +9,7 @@ mod browser;
 #[expect(dead_code, reason = "other tests compare the robot with ray casting")]
 mod robot;
 
-use browser::{Browser, browser_for_page, wait_for};
+use browser::{Browser, WEBGL_STUB, browser_for_page, wait_for};
 use kinematics::{Stamp, Transform};
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -23,39 +23,6 @@ const N_KEYFRAMES: i64 = 400;
 const DURATION: Duration = Duration::from_secs(8);
 /// Limit of the 99th percentile. The goal is 4 ms on an idle computer; other tests run beside this one.
 const MAX_P99_MILLIS: f64 = 16.0;
-
-/// A WebGL context that accepts every call and draws nothing.
-const STUB: &str = r"
-const real = WebGL2RenderingContext;
-HTMLCanvasElement.prototype.getContext = new Proxy(HTMLCanvasElement.prototype.getContext, {
-  apply(original, canvas, args) {
-    if (args[0] !== 'webgl2') return Reflect.apply(original, canvas, args);
-    const answers = {
-      canvas, drawingBufferWidth: 1280, drawingBufferHeight: 720, drawingBufferColorSpace: 'srgb',
-      getParameter: (name) => name === real.VERSION ? 'WebGL 2.0'
-        : name === real.SHADING_LANGUAGE_VERSION ? 'WebGL GLSL ES 3.00'
-        : name === real.SCISSOR_BOX || name === real.VIEWPORT ? new Int32Array([0, 0, 1280, 720]) : 4096,
-      getShaderPrecisionFormat: () => ({ rangeMin: 127, rangeMax: 127, precision: 23 }),
-      getContextAttributes: () => ({ alpha: true, antialias: true, depth: true }),
-      getSupportedExtensions: () => [],
-      getExtension: () => null,
-      isContextLost: () => false,
-      getProgramParameter: (_, name) => name === real.LINK_STATUS ? true : 0,
-      getShaderParameter: () => true,
-      getProgramInfoLog: () => '',
-      getShaderInfoLog: () => '',
-      getError: () => 0,
-      checkFramebufferStatus: () => real.FRAMEBUFFER_COMPLETE,
-    };
-    canvas.stub ??= new Proxy(answers, {
-      get: (_, name) => name in answers ? answers[name]
-        : name in real ? real[name]
-        : String(name).startsWith('create') ? () => ({})
-        : () => undefined,
-    });
-    return canvas.stub;
-  },
-});";
 
 fn keyframe(stamp: i64) -> KeyframePose {
     KeyframePose {
@@ -129,7 +96,7 @@ fn tasks_of_the_main_thread_are_short() {
     let mut tasks = std::thread::scope(|scope| {
         scope.spawn(|| publish(&hub, &is_over));
         scope.spawn(|| deliver(&hub, &is_over));
-        let mut browser = Browser::open_with(&program, &profile, &server.url(), WINDOW_PX, STUB);
+        let mut browser = Browser::open_with(&program, &profile, &server.url(), WINDOW_PX, WEBGL_STUB);
         wait_for(&mut browser, "a full picture", |browser| browser.text("picture-text").contains("100 %"));
         let tasks = browser.trace_tasks(DURATION);
         assert!(browser.text("picture-text").contains("100 %"), "pictures still arrive");

@@ -10,7 +10,7 @@ use trainer::splat::arrays::SplatArrays;
 use trainer::splat::cloud::scan_cloud;
 use trainer::splat::{SplatOptions, SplatTrainer};
 use trainer::tsdf::{TsdfModel, TsdfOptions};
-use trainer::{Method, ModelOptions, RenderRequest};
+use trainer::{Method, ModelOptions, Projection, RenderRequest};
 use viz::Hub;
 
 /// A wall of splats at y = 0 that faces -y. Without color coefficients of degree 3, which are not sent.
@@ -95,8 +95,12 @@ fn serve(hub: &Hub, mut models: Models, requests: &Mutex<Vec<ReceivedRequest>>, 
     while !stop.load(Ordering::Relaxed) {
         hub.wait_for_request(Duration::from_millis(20));
         if let Some(pending) = hub.next_request() {
+            let is_panorama = pending.request.projection == Projection::Equirectangular;
             let has_color = pending.packing().is_none_or(|packing| packing.jpeg_quality.is_some());
-            requests.lock().expect("no panic").push((pending.request.clone(), has_color));
+            // Panoramas are requested for the surroundings of a view.
+            if !is_panorama {
+                requests.lock().expect("no panic").push((pending.request.clone(), has_color));
+            }
             let name = pending.method().unwrap_or(models[0].0).to_owned();
             match models.iter_mut().find(|(other, _)| *other == name) {
                 Some((_, model)) => {

@@ -49,6 +49,11 @@ export class LocalModel {
     return this.meshes.root.children.length > 0;
   }
 
+  /** The first surface of the drawn mesh on a ray: its distance and normal. */
+  hit(from: THREE.Vector3, direction: THREE.Vector3, maxM: number): { distance: number; normal: THREE.Vector3 } | null {
+    return this.root.visible ? this.meshes.hit(from, direction, maxM) : null;
+  }
+
   /** Drops all chunks. The server sends them again after a new subscription. */
   clear(): void {
     this.generation += 1;

@@ -17,7 +17,9 @@ import { Readouts } from "./readouts";
 import { RenderScheduler } from "./render_scheduler";
 import { RobotAge } from "./robot_age";
 import { RunControls } from "./run_controls";
+import { SideView } from "./side_view";
 import { Subscriptions } from "./subscriptions";
+import { Surroundings } from "./surroundings";
 import { ViewSettings } from "./view_settings";
 
 let stages = [0.1, 0.5, 1];
@@ -53,6 +55,7 @@ const connection = new Connection(`${location.protocol === "https:" ? "wss" : "w
       liveImages.forget();
       robotAge.forget();
       scheduler.restart();
+      for (const side of sides) side.restart();
       view.points.clear();
       view.scans.clear();
       view.scans.setPath([]);
@@ -73,11 +76,17 @@ const runControls = new RunControls(connection);
 new LinkReadout(connection);
 const models = new ModelSwitch(() => {
   scheduler.restart();
+  view.forgetSurfaces();
   if (latestStatus) showStatus(latestStatus);
 });
 let isDrawnLocally = false;
 const scheduler = new RenderScheduler(connection, () => view.view(), () => stages, BACKGROUND, () => models.method);
-
+const sides = [new SideView(connection, "surroundings")] as const;
+const surroundings = new Surroundings(
+  sides[0],
+  (shown) => scheduler.picture(shown),
+  (map) => view.see("surroundings", map),
+);
 const settings = new ViewSettings(view, scheduler);
 
 function receiveText(message: TextMessage): void {
@@ -125,6 +134,7 @@ function receiveText(message: TextMessage): void {
       view.local.removed(message);
       break;
     case "error":
+      if (sides.some((side) => side.fail(message))) break;
       scheduler.failed(message.id);
       element("notice").textContent = message.message;
       break;
@@ -162,7 +172,7 @@ function showLocalProgress(): void {
 
 function receiveBinary(header: BinaryHeader, payload: Uint8Array<ArrayBuffer>): void {
   if (header.type === "picture") {
-    void showPicture(header, payload);
+    if (!sides.some((side) => side.receive(header, payload))) void showPicture(header, payload);
   } else if (header.type === "range_scan") {
     view.scans.show(header, payload);
     element("toggle-scans").hidden = false;
@@ -194,6 +204,7 @@ async function showPicture(header: PictureHeader, payload: Uint8Array<ArrayBuffe
     return;
   }
   view.changed();
+  view.seePicture();
   element("notice").textContent = "";
   if (!header.color) return;
   const [width, height] = header.size_px;
@@ -224,6 +235,7 @@ function action(id: string, key: string, act: () => void): void {
   });
 }
 
+toggle("toggle-fly", "y", (isOn) => (view.flies = isOn));
 action("reset-view", "r", () => view.reset());
 action("full-screen", "u", () => {
   if (document.fullscreenElement) void document.exitFullscreen();
@@ -272,6 +284,8 @@ toggle("toggle-occlude", "o", (isOn) => (view.occlusion.enabled = isOn));
 function frame(): void {
   settings.tick();
   scheduler.tick();
+  // The first picture comes first.
+  if (view.picture.posedDepth && showsModel) surroundings.tick(view.view(), models.method);
   view.draw();
   requestAnimationFrame(frame);
 }
