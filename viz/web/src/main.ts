@@ -81,13 +81,13 @@ const models = new ModelSwitch(() => {
 });
 let isDrawnLocally = false;
 const scheduler = new RenderScheduler(connection, () => view.view(), () => stages, BACKGROUND, () => models.method);
-const sides = [new SideView(connection, "surroundings")] as const;
+const sides = [new SideView(connection, "surroundings"), new SideView(connection, "video")] as const;
 const surroundings = new Surroundings(
   sides[0],
   (shown) => scheduler.picture(shown),
   (map) => view.see("surroundings", map),
 );
-const settings = new ViewSettings(view, scheduler);
+const settings = new ViewSettings(view, scheduler, sides[1]);
 
 function receiveText(message: TextMessage): void {
   switch (message.type) {

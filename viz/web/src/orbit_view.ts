@@ -327,6 +327,20 @@ export class OrbitView {
     };
   }
 
+  /** The current view from a place on the camera path. */
+  viewAlong({ position, target, fovDegrees }: PathView, [width, height]: [number, number]): View {
+    const camera = new THREE.PerspectiveCamera(fovDegrees, width / height);
+    camera.up.copy(this.camera.up);
+    camera.position.copy(position);
+    camera.lookAt(target);
+    return {
+      ...this.view(),
+      world_from_camera: poseOfThreeCamera(camera),
+      size_px: [width, height],
+      projection: pinholeOfThreeCamera(camera, [width, height]),
+    };
+  }
+
   /** Depth at which pixels without any model are placed. */
   get emptyDepth(): number {
     return 0.9 * this.camera.far;
