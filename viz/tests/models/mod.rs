@@ -56,6 +56,8 @@ pub(crate) fn tsdf_model(n_keyframes: usize) -> TsdfModel {
 /// Models by method, and the requests so far.
 pub(crate) struct ModelThread {
     requests: Arc<Mutex<Vec<ReceivedRequest>>>,
+    /// Whether requests for depth alone fail.
+    refuses_depth: Arc<AtomicBool>,
     stop: Arc<AtomicBool>,
     thread: Option<std::thread::JoinHandle<Models>>,
 }
@@ -68,10 +70,15 @@ pub(crate) type Models = Vec<(&'static str, Box<dyn Method + Send>)>;
 impl ModelThread {
     pub(crate) fn start(hub: Hub, models: Models) -> Self {
         let requests: Arc<Mutex<Vec<ReceivedRequest>>> = Arc::default();
-        let stop: Arc<AtomicBool> = Arc::default();
-        let (received, stopped) = (Arc::clone(&requests), Arc::clone(&stop));
-        let thread = std::thread::spawn(move || serve(&hub, models, &received, &stopped));
-        Self { requests, stop, thread: Some(thread) }
+        let (refuses_depth, stop): (Arc<AtomicBool>, Arc<AtomicBool>) = Default::default();
+        let (received, refuses, stopped) = (Arc::clone(&requests), Arc::clone(&refuses_depth), Arc::clone(&stop));
+        let thread = std::thread::spawn(move || serve(&hub, models, &received, &refuses, &stopped));
+        Self { requests, refuses_depth, stop, thread: Some(thread) }
+    }
+
+    /// Lets requests for depth alone fail from now on.
+    pub(crate) fn refuse_depth(&self) {
+        self.refuses_depth.store(true, Ordering::Relaxed);
     }
 
     /// The newest request.
@@ -91,7 +98,13 @@ impl ModelThread {
     }
 }
 
-fn serve(hub: &Hub, mut models: Models, requests: &Mutex<Vec<ReceivedRequest>>, stop: &AtomicBool) -> Models {
+fn serve(
+    hub: &Hub,
+    mut models: Models,
+    requests: &Mutex<Vec<ReceivedRequest>>,
+    refuses_depth: &AtomicBool,
+    stop: &AtomicBool,
+) -> Models {
     while !stop.load(Ordering::Relaxed) {
         hub.wait_for_request(Duration::from_millis(20));
         if let Some(pending) = hub.next_request() {
@@ -100,6 +113,10 @@ fn serve(hub: &Hub, mut models: Models, requests: &Mutex<Vec<ReceivedRequest>>, 
             // Panoramas are requested for the surroundings of a view.
             if !is_panorama {
                 requests.lock().expect("no panic").push((pending.request.clone(), has_color));
+            }
+            if !has_color && refuses_depth.load(Ordering::Relaxed) {
+                pending.fail("");
+                continue;
             }
             let name = pending.method().unwrap_or(models[0].0).to_owned();
             match models.iter_mut().find(|(other, _)| *other == name) {

@@ -44,6 +44,11 @@ export class LocalModel {
     return this.progress.nChunks > 0;
   }
 
+  /** Draws the depth of the splats, see splat_depth.ts. */
+  drawDepth(renderer: THREE.WebGLRenderer, camera: THREE.Camera, sizePx: [number, number]): THREE.Texture {
+    return this.splats.drawDepth(renderer, camera, sizePx);
+  }
+
   /** Whether the model is a mesh, which hides what lies behind it. */
   get hasDepth(): boolean {
     return this.meshes.root.children.length > 0;

@@ -10,7 +10,7 @@ import { EyeGuard, type Stand } from "./eye_guard";
 import { FlyControls } from "./fly_controls";
 import { LocalModel } from "./local_model";
 import { MeasureTool } from "./measure";
-import { Occlusion } from "./occlusion";
+import { Occlusion, type OcclusionDepth } from "./occlusion";
 import { Overlays } from "./overlays";
 import { PictureLayer } from "./picture_layer";
 import { PointsLayer } from "./points_layer";
@@ -373,12 +373,25 @@ export class OrbitView {
     this.local.setView(view, [this.canvas.width, this.canvas.height]);
     const hasDepthBuffer = isLocal && this.local.hasDepth;
     this.occlusion.usesDepthBuffer = hasDepthBuffer;
+    this.occlusion.local = isLocal && !hasDepthBuffer && this.occlusion.enabled ? this.splatDepth(view) : null;
     this.crop.update();
     this.measure.update();
     this.renderer.clear();
     this.renderer.render(this.background, this.camera);
     if (!hasDepthBuffer || !this.occlusion.enabled) this.renderer.clearDepth();
     this.renderer.render(this.world, this.camera);
+  }
+
+  /** Draws the depth of the splats as seen in the view. */
+  private splatDepth(view: View): OcclusionDepth {
+    return {
+      texture: this.local.drawDepth(this.renderer, this.camera, [this.canvas.width, this.canvas.height]),
+      isWeighted: true,
+      worldFromPicture: worldFromCamera(view.world_from_camera),
+      sizePx: view.size_px,
+      focalPx: view.projection.focal_px,
+      principalPx: view.projection.principal_px,
+    };
   }
 
   private fit(): void {

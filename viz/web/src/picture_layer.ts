@@ -124,17 +124,15 @@ export class PictureLayer {
     uniforms.focalPx!.value.fromArray(header.projection.focal_px);
     uniforms.principalPx!.value.fromArray(header.projection.principal_px);
     uniforms.emptyDepth!.value = emptyDepth;
-    const { focal_px, principal_px } = header.projection;
-    this.occlusion.setPicture(depth, worldFromPicture, header.full_size_px, focal_px, principal_px);
-    const { data, width, height } = depth.image as { data: Float32Array; width: number; height: number };
-    this.posedDepth = {
+    const camera = {
       worldFromPicture,
       sizePx: header.full_size_px,
-      focalPx: focal_px,
-      principalPx: principal_px,
-      depth: data,
-      depthSizePx: [width, height],
+      focalPx: header.projection.focal_px,
+      principalPx: header.projection.principal_px,
     };
+    this.occlusion.picture = { texture: depth, isWeighted: false, ...camera };
+    const { data, width, height } = depth.image as { data: Float32Array; width: number; height: number };
+    this.posedDepth = { ...camera, depth: data, depthSizePx: [width, height] };
     this.enabled = this.isEnabled;
     return true;
   }
