@@ -6,7 +6,13 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 
 /// Files written by `scripts/build-web.sh`.
-const BUNDLE: [&str; 4] = ["web/dist/index.html", "web/dist/app.js", "web/dist/splat_worker.js", "web/dist/app.css"];
+const BUNDLE: [&str; 5] = [
+    "web/dist/index.html",
+    "web/dist/app.js",
+    "web/dist/splat_worker.js",
+    "web/dist/video_worker.js",
+    "web/dist/app.css",
+];
 /// The page of binaries built without Node.js.
 const WITHOUT_BUNDLE: [&str; 2] = ["src/without_bundle.html", "src/without_bundle.css"];
 

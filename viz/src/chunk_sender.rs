@@ -1,10 +1,11 @@
 //! Decides which chunk of a model a client receives next: first all chunks coarsely, then all in full, then the chunks
-//! that have changed most, within a budget.
+//! that have changed most, within a budget. While the client's copy is incomplete, chunks in its view come first.
 
 use crate::chunk_list::{ChunkList, VersionedChunk};
 use crate::pose::row_major;
 use crate::server_message::{BinaryHeader, ChunkHeader, ServerMessage, frame};
 use crate::subscriptions::ChunkSubscription;
+use crate::viewpoint::Viewpoint;
 use axum::extract::ws::Message;
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -47,14 +48,20 @@ pub(crate) enum NextChunk {
 }
 
 impl ChunkSender {
-    /// The next message, which counts as sent.
-    pub(crate) fn next(&mut self, list: &ChunkList, subscription: &ChunkSubscription, now: Instant) -> NextChunk {
+    /// The next message, which counts as sent. `viewpoint` is that of the client's newest picture.
+    pub(crate) fn next(
+        &mut self,
+        list: &ChunkList,
+        subscription: &ChunkSubscription,
+        viewpoint: Option<&Viewpoint>,
+        now: Instant,
+    ) -> NextChunk {
         if subscription.number != self.n_subscriptions {
             *self = Self { n_subscriptions: subscription.number, ..Self::default() };
         }
         self.refill(subscription.max_bytes_per_sec, now);
         let unsent = |chunk: &&Arc<VersionedChunk>| !self.sent.contains_key(&chunk.chunk.id);
-        if let Some(chunk) = most_changed(list.chunks.values().filter(unsent), |chunk| chunk.total_change) {
+        if let Some(chunk) = first_needed(list, viewpoint, unsent) {
             let is_fine = chunk.chunk.coarse.is_none();
             return self.send(list, &chunk, is_fine, subscription);
         }
@@ -68,7 +75,7 @@ impl ChunkSender {
             return NextChunk::Send(Message::text(message.to_json()));
         }
         let is_coarse = |chunk: &&Arc<VersionedChunk>| self.sent.get(&chunk.chunk.id).is_some_and(|sent| !sent.is_fine);
-        if let Some(chunk) = most_changed(list.chunks.values().filter(is_coarse), |chunk| chunk.total_change) {
+        if let Some(chunk) = first_needed(list, viewpoint, is_coarse) {
             return self.send(list, &chunk, true, subscription);
         }
         let missed = |chunk: &VersionedChunk| {
@@ -120,6 +127,20 @@ impl ChunkSender {
     }
 }
 
+/// The chunk that is needed first for a view; without a view, the one that has changed most.
+fn first_needed(
+    list: &ChunkList,
+    viewpoint: Option<&Viewpoint>,
+    is_candidate: impl Fn(&&Arc<VersionedChunk>) -> bool,
+) -> Option<Arc<VersionedChunk>> {
+    let candidates = list.chunks.values().filter(is_candidate);
+    let Some(viewpoint) = viewpoint else { return most_changed(candidates, |chunk| chunk.total_change) };
+    let ranked = candidates.map(|chunk| (viewpoint.rank(&list.world_from_model, &chunk.chunk.fine.layout), chunk));
+    let first =
+        ranked.min_by(|((a_hidden, a_m), _), ((b_hidden, b_m), _)| a_hidden.cmp(b_hidden).then(a_m.total_cmp(b_m)));
+    first.map(|(_, chunk)| Arc::clone(chunk))
+}
+
 fn most_changed<'a>(
     chunks: impl Iterator<Item = &'a Arc<VersionedChunk>>,
     change: impl Fn(&VersionedChunk) -> f64,
@@ -133,6 +154,8 @@ mod tests {
     use crate::chunk_list::ChunkList;
     use crate::chunk_list::tests::{chunk, complete};
     use crate::subscriptions::ChunkSubscription;
+    use crate::viewpoint::Viewpoint;
+    use crate::viewpoint::tests::{cube, viewpoint};
     use axum::extract::ws::Message;
     use serde_json::Value;
     use std::time::{Duration, Instant};
@@ -150,34 +173,38 @@ mod tests {
     struct Receiver {
         sender: ChunkSender,
         number: u64,
+        viewpoint: Option<Viewpoint>,
         now: Instant,
         n_bytes: usize,
     }
 
     impl Receiver {
         fn new() -> Self {
-            Self { sender: ChunkSender::default(), number: 1, now: Instant::now(), n_bytes: 0 }
+            Self { sender: ChunkSender::default(), number: 1, viewpoint: None, now: Instant::now(), n_bytes: 0 }
         }
 
         /// Receives until nothing more is sent now. Returns `id` or `id coarse` of chunks, and `- ids` of removed ones.
         fn receive(&mut self, list: &ChunkList) -> Vec<String> {
-            let mut received = Vec::new();
-            while let NextChunk::Send(message) = self.sender.next(list, &subscription(self.number), self.now) {
-                received.push(match message {
-                    Message::Binary(bytes) => {
-                        self.n_bytes += bytes.len();
-                        let n_header = u32::from_le_bytes(bytes[..4].try_into().expect("4 bytes")) as usize;
-                        let header: Value = serde_json::from_slice(&bytes[4..4 + n_header]).expect("JSON");
-                        let suffix = if header["is_coarse"] == true { " coarse" } else { "" };
-                        format!("{}{suffix}", header["id"])
-                    }
-                    other => {
-                        let text: Value = serde_json::from_str(&other.into_text().expect("text")).expect("JSON");
-                        format!("- {}", text["ids"])
-                    }
-                });
-            }
-            received
+            std::iter::from_fn(|| self.receive_one(list)).collect()
+        }
+
+        fn receive_one(&mut self, list: &ChunkList) -> Option<String> {
+            let subscription = subscription(self.number);
+            let next = self.sender.next(list, &subscription, self.viewpoint.as_ref(), self.now);
+            let NextChunk::Send(message) = next else { return None };
+            Some(match message {
+                Message::Binary(bytes) => {
+                    self.n_bytes += bytes.len();
+                    let n_header = u32::from_le_bytes(bytes[..4].try_into().expect("4 bytes")) as usize;
+                    let header: Value = serde_json::from_slice(&bytes[4..4 + n_header]).expect("JSON");
+                    let suffix = if header["is_coarse"] == true { " coarse" } else { "" };
+                    format!("{}{suffix}", header["id"])
+                }
+                other => {
+                    let text: Value = serde_json::from_str(&other.into_text().expect("text")).expect("JSON");
+                    format!("- {}", text["ids"])
+                }
+            })
         }
     }
 
@@ -191,6 +218,27 @@ mod tests {
         assert!(client.receive(&list).is_empty());
         client.number = 2;
         assert_eq!(client.receive(&list).len(), 6, "a new subscription begins with all chunks");
+    }
+
+    #[test]
+    fn an_incomplete_copy_is_completed_in_view_first() {
+        let mut list = ChunkList::default();
+        let at = |id, change, z: f32| {
+            let mut chunk = chunk(id, change, 1000);
+            chunk.fine.layout = cube([0.0, 0.0, z]);
+            chunk
+        };
+        list.apply(complete(vec![at(1, 1.0, 2.0), at(2, 9.0, 5.0), at(3, 5.0, -1.0), at(4, 7.0, -3.0)]));
+        let mut client = Receiver { viewpoint: Some(viewpoint(0.0, 0.0)), ..Receiver::new() };
+        let coarse: Vec<_> = (0..4).filter_map(|_| client.receive_one(&list)).collect();
+        assert_eq!(coarse, ["1 coarse", "2 coarse", "3 coarse", "4 coarse"]);
+        assert_eq!(client.receive_one(&list).as_deref(), Some("1"));
+        client.viewpoint = Some(viewpoint(0.0, std::f64::consts::PI));
+        assert_eq!(client.receive(&list), ["3", "4", "2"], "the view has turned");
+        // A complete copy is updated where it has changed most.
+        client.now += Duration::from_secs(10);
+        list.apply(changes(vec![at(1, 1.0, 2.0), at(2, 9.0, 5.0), at(3, 5.0, -1.0)], Vec::new()));
+        assert_eq!(client.receive(&list), ["2", "3", "1"]);
     }
 
     #[test]

@@ -4,6 +4,7 @@ use crate::broadcast::{Item, LatestMessages};
 use crate::chunk_sender::{ChunkSender, NextChunk};
 use crate::keyframe_log::{Changes, ListPosition};
 use crate::subscriptions::Subscriptions;
+use crate::viewpoint::Viewpoint;
 use axum::extract::ws::Message;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -33,6 +34,8 @@ pub(crate) struct ClientUpdates {
     /// Number of the subscription to points that these points belong to.
     n_point_subscriptions: u64,
     model_chunks: ChunkSender,
+    /// Viewpoint of the client's newest picture.
+    pub(crate) viewpoint: Option<Viewpoint>,
 }
 
 /// Number of the last item of a kind, and when it was sent.
@@ -245,7 +248,7 @@ impl ClientUpdates {
     ) -> Option<Message> {
         let subscription = subscriptions.model_chunks.as_ref()?;
         let list = latest.model_chunks.get(&subscription.method)?;
-        match self.model_chunks.next(list, subscription, timer.now) {
+        match self.model_chunks.next(list, subscription, self.viewpoint.as_ref(), timer.now) {
             NextChunk::Send(message) => Some(message),
             NextChunk::WaitUntil(due) => {
                 timer.wait_until(due);

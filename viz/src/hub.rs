@@ -14,6 +14,7 @@ use crate::server_message::PictureHeader;
 use crate::subscriptions::Subscriptions;
 use crate::updates::{KeyframePose, LiveImage, RunResult, SceneHint, Status};
 use crate::view_request::ViewRequest;
+use crate::viewpoint::Viewpoint;
 use keyframe::Keyframe;
 use kinematics::{Stamp, Transform};
 use parking_lot::{Condvar, Mutex, MutexGuard};
@@ -58,12 +59,14 @@ pub(crate) struct Demand {
     pub(crate) subscriptions: Arc<Subscriptions>,
     /// Whether it receives only the changes of the keyframe list.
     pub(crate) has_keyframe_changes: bool,
+    /// Viewpoint of its newest picture.
+    pub(crate) viewpoint: Option<Viewpoint>,
 }
 
 impl Demand {
     /// The demand of a client that has sent nothing.
     pub(crate) fn new(joined: Instant) -> Self {
-        Self { joined, has_hello: false, subscriptions: Arc::default(), has_keyframe_changes: false }
+        Self { joined, has_hello: false, subscriptions: Arc::default(), has_keyframe_changes: false, viewpoint: None }
     }
 
     /// The time from which the client gets keyframes and images, if it is later.

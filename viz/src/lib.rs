@@ -51,6 +51,7 @@ mod subscriptions;
 mod tls;
 mod updates;
 mod view_request;
+mod viewpoint;
 mod writer;
 
 pub use access::{Role, Token, Tokens};

@@ -30,6 +30,7 @@ pub(crate) const FILES: &[PageFile] = &[
     page_file!("/", "text/html; charset=utf-8", "../web/dist/", "index.html"),
     page_file!("/app.js", "text/javascript; charset=utf-8", "../web/dist/", "app.js"),
     page_file!("/splat_worker.js", "text/javascript; charset=utf-8", "../web/dist/", "splat_worker.js"),
+    page_file!("/video_worker.js", "text/javascript; charset=utf-8", "../web/dist/", "video_worker.js"),
     page_file!("/app.css", "text/css; charset=utf-8", "../web/dist/", "app.css"),
 ];
 

@@ -11,6 +11,7 @@ use crate::protocol::{ClientMessage, ControlMessage, ShownMessage, SubscribeMess
 use crate::queue::MAX_VIEWS;
 use crate::server_context::ServerContext;
 use crate::view_request::{InvalidRequest, ViewRequest};
+use crate::viewpoint::Viewpoint;
 use crate::writer::{Reply, Writer};
 use axum::extract::ws::{Message, WebSocket};
 use futures_util::StreamExt;
@@ -136,6 +137,9 @@ impl Reader<'_> {
             }),
             ClientMessage::Render(message) => {
                 let view_request = ViewRequest::check(&message)?;
+                if let Some(viewpoint) = Viewpoint::of(&view_request.request) {
+                    self.demand.send_modify(|demand| demand.viewpoint = Some(viewpoint));
+                }
                 if !self.hub.view_request(self.client, view_request) {
                     return Err(InvalidRequest::Views { max: MAX_VIEWS });
                 }

@@ -132,6 +132,7 @@ impl Writer<'_> {
             }
             let (subscriptions, settles_at) = {
                 let demand = demand.borrow_and_update();
+                updates.viewpoint = demand.viewpoint;
                 (Arc::clone(&demand.subscriptions), demand.settles_at(Instant::now()))
             };
             let mut update_due = settles_at;

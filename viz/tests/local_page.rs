@@ -7,14 +7,16 @@ mod browser;
 mod models;
 
 use browser::{Browser, browser_for_page, canvas_shot, wait_for};
-use kinematics::Transform;
+use kinematics::{Stamp, Transform};
 use models::{ModelThread, splat_model, tsdf_model, wall};
 use nalgebra::{Point3, UnitQuaternion, Vector3};
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 use trainer::eval::{PixelPair, psnr};
 use trainer::{Method, RenderRequest};
-use viz::{Hub, ModelStatus, ObservationMap, ObservedCell, SceneHint, Server, ServerConfig, Status};
+use viz::{
+    Hub, LiveImage, LivePixels, ModelStatus, ObservationMap, ObservedCell, SceneHint, Server, ServerConfig, Status,
+};
 
 const WINDOW_PX: [u32; 2] = [1000, 640];
 /// Required PSNR of the page's own drawing against the server's picture, dB.
@@ -38,12 +40,14 @@ fn shot_psnr(request: &RenderRequest, shot: &image::RgbImage, rgba: &[u8]) -> f6
     psnr(&PixelPair::new(size_px, &middle(&shown), &expected).expect("sizes")).expect("a score")
 }
 
+fn has_all_parts(browser: &mut Browser) -> bool {
+    let text = browser.text("picture-text");
+    text.contains("drawn here") && !text.contains(" of ")
+}
+
 /// Waits until the page shows the model as the server does.
 fn check_local(browser: &mut Browser, thread: &ModelThread, model: &mut dyn Method, (name, min_db): (&str, f64)) {
-    wait_for(browser, "all parts of the model", |browser| {
-        let text = browser.text("picture-text");
-        text.contains("drawn here") && !text.contains(" of ")
-    });
+    wait_for(browser, "all parts of the model", has_all_parts);
     let began = Instant::now();
     loop {
         let request = thread.last_request();
@@ -176,6 +180,77 @@ fn local_drawing_equals_the_pictures_of_the_server() {
     wait_for(&mut browser, "no local model", |browser| {
         browser.evaluate("document.getElementById('toggle-local').hidden") == true
     });
+    drop(browser);
+    drop(thread.finish());
+    std::fs::remove_dir_all(&profile).expect("the browser has left its profile");
+}
+
+/// Number of pixels in the color of live cameras, which the model does not have.
+fn n_accent_pixels(browser: &mut Browser, name: &str) -> usize {
+    let shot = canvas_shot(browser);
+    shot.save(PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join(format!("page-behind-{name}.png"))).expect("written");
+    let is_accent = |[red, green, blue]: [u8; 3]| green >= red.saturating_add(60) && blue >= red.saturating_add(40);
+    // Between the toolbar and the texts at the bottom.
+    let rows = 60..shot.height() / 2;
+    shot.enumerate_pixels().filter(|(_, y, pixel)| rows.contains(y) && is_accent(pixel.0)).count()
+}
+
+/// A camera whose frustum is parallel to the wall, at this position along y.
+fn live_image(y: f64) -> LiveImage {
+    LiveImage {
+        camera: "wrist".into(),
+        stamp: Stamp(1),
+        captured_at: Instant::now(),
+        size_px: [32, 32],
+        pixels: LivePixels::Rgba(vec![90; 32 * 32 * 4].into()),
+        world_from_camera: Some(Transform::translation(-0.3, y, 0.2)),
+        focal_px: [32.0; 2],
+        principal_px: [16.0; 2],
+    }
+}
+
+/// The depth of local splats hides objects behind them, without any depth from the server.
+#[test]
+fn local_splats_hide_what_lies_behind_them() {
+    let Some(program) = browser_for_page() else { return };
+    let hub = Hub::new();
+    // Away from the wall, so that the first picture does not show it.
+    let rotation = UnitQuaternion::face_towards(&-Vector3::y(), &-Vector3::z());
+    hub.set_scene_hint(SceneHint {
+        center_m: [0.0, 0.0, 0.1],
+        radius_m: 1.0,
+        world_from_camera: Transform::from_parts(Point3::new(0.0, -1.0, 0.3).into(), rotation),
+    });
+    let status = ModelStatus { method: "splat".to_owned(), has_chunks: true, ..ModelStatus::default() };
+    hub.set_status(Status { model: status, ..Status::default() });
+    let mut splats = wall(20_000);
+    splats.opacity_logits.fill(3.0);
+    splats.sh.fill([0.0; 3]); // Gray.
+    let models: models::Models = vec![("splat", Box::new(splat_model(&splats)))];
+    let thread = ModelThread::start(hub.clone(), models);
+    let server = Server::start(ServerConfig { listen: ([127, 0, 0, 1], 0).into() }, hub.clone()).expect("a free port");
+    let profile = PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join(format!("chromium-behind-{}", std::process::id()));
+    let mut browser = Browser::open(&program, &profile, &server.url(), [800, 500]);
+    wait_for(&mut browser, "a full picture", |browser| browser.text("picture-text").contains("100 %"));
+    thread.refuse_depth();
+    browser.click("toggle-local");
+    wait_for(&mut browser, "all parts of the model", has_all_parts);
+    browser.click("look-front");
+    for (y, name) in [(0.4, "hidden"), (-0.4, "in-front")] {
+        hub.set_live_image(live_image(y));
+        wait_for(&mut browser, "the live camera", |browser| {
+            browser.evaluate("document.querySelectorAll('#live canvas').length") == 1
+        });
+        std::thread::sleep(Duration::from_millis(700));
+        let n_shown = n_accent_pixels(&mut browser, name);
+        browser.click("toggle-occlude");
+        let n_all = n_accent_pixels(&mut browser, &format!("{name}-without-occlusion"));
+        browser.click("toggle-occlude");
+        eprintln!("{name}: {n_shown} of {n_all} pixels");
+        assert!(n_all > 60, "{name}: the camera covers {n_all} pixels");
+        let is_right = if y > 0.0 { n_shown * 20 < n_all } else { n_shown * 10 > n_all * 9 };
+        assert!(is_right, "{name}: {n_shown} of {n_all} pixels");
+    }
     drop(browser);
     drop(thread.finish());
     std::fs::remove_dir_all(&profile).expect("the browser has left its profile");

@@ -115,6 +115,42 @@ fn a_client_receives_both_kinds_of_models_in_full() {
     drop(thread.finish());
 }
 
+/// Distance from a position to the center of a chunk of splats.
+fn distance(header: &Value, from: [f64; 3]) -> f64 {
+    let corner = |name: &str, axis: usize| header[name][axis].as_f64().expect("a coordinate");
+    let offset = |axis| 0.5 * (corner("min_m", axis) + corner("max_m", axis)) - from[axis];
+    [0, 1, 2].map(offset).iter().map(|along| along * along).sum::<f64>().sqrt()
+}
+
+#[test]
+fn chunks_near_the_requested_view_come_first() {
+    let (hub, server) = start();
+    let thread = ModelThread::start(hub, vec![("splat", Box::new(splat_model(&wall(60_000))))]);
+    let mut client = connect(server.address());
+    let eye = [1.8, -0.4, 1.2];
+    // Looks along y; the wide view contains the whole wall.
+    let pose = [1.0, 0.0, 0.0, eye[0], 0.0, 0.0, 1.0, eye[1], 0.0, -1.0, 0.0, eye[2], 0.0, 0.0, 0.0, 1.0];
+    client.send_json(&json!({
+        "type": "render", "id": 1, "world_from_camera": pose, "size_px": [32, 32],
+        "projection": {"kind": "pinhole", "vertical_fov_rad": 3.1},
+    }));
+    subscribe(&mut client, "splat");
+    let mut distances: [Vec<f64>; 2] = Default::default();
+    let mut n_incomplete = None;
+    while n_incomplete != Some(0) {
+        let Received::Binary(header, _) = client.receive() else { continue };
+        if header["type"] == "model_chunk" {
+            n_incomplete = header["n_incomplete"].as_u64();
+            distances[usize::from(header["is_coarse"] == false)].push(distance(&header, eye));
+        }
+    }
+    for distances in &distances {
+        assert!(distances.len() > 3, "{distances:?}");
+        assert!(distances.is_sorted(), "{distances:?}");
+    }
+    drop(thread.finish());
+}
+
 #[test]
 fn changes_arrive_and_the_copy_equals_the_model() {
     let (hub, server) = start();

@@ -77,12 +77,14 @@ impl RenderThread {
         Self { received_requests, stop, thread: Some(thread) }
     }
 
+    /// The requests of the main view. Panoramas are requested for its surroundings.
     fn requests(&self) -> Vec<RenderRequest> {
         self.received_requests
             .lock()
             .expect("no thread panicked while holding the lock")
             .iter()
             .map(|(request, _)| request.clone())
+            .filter(|request| request.projection != Projection::Equirectangular)
             .collect()
     }
 

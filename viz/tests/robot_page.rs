@@ -45,7 +45,10 @@ impl Run {
                 while !stop.load(Ordering::Relaxed) {
                     hub.wait_for_request(Duration::from_millis(50));
                     if let Some(pending) = hub.next_request() {
-                        requests.lock().expect("no panic").push(pending.request.clone());
+                        // Panoramas are requested for the surroundings of the view.
+                        if pending.request.projection != Projection::Equirectangular {
+                            requests.lock().expect("no panic").push(pending.request.clone());
+                        }
                         let picture = draw(&pending.request);
                         pending.deliver(picture);
                     }

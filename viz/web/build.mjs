@@ -1,4 +1,4 @@
-// Bundles the page into dist/: one HTML, one script, one worker, one stylesheet, nothing loaded from elsewhere.
+// Bundles the page into dist/: one HTML, one script, two workers, one stylesheet, nothing loaded from elsewhere.
 
 import { build } from "esbuild";
 import { copyFileSync, mkdirSync, utimesSync } from "node:fs";
@@ -8,7 +8,11 @@ import { fileURLToPath } from "node:url";
 const here = dirname(fileURLToPath(import.meta.url));
 mkdirSync(join(here, "dist"), { recursive: true });
 await build({
-  entryPoints: { app: join(here, "src/main.ts"), splat_worker: join(here, "src/splat_worker.ts") },
+  entryPoints: {
+    app: join(here, "src/main.ts"),
+    splat_worker: join(here, "src/splat_worker.ts"),
+    video_worker: join(here, "src/video_worker.ts"),
+  },
   outdir: join(here, "dist"),
   bundle: true,
   minify: true,

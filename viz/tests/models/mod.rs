@@ -10,7 +10,7 @@ use trainer::splat::arrays::SplatArrays;
 use trainer::splat::cloud::scan_cloud;
 use trainer::splat::{SplatOptions, SplatTrainer};
 use trainer::tsdf::{TsdfModel, TsdfOptions};
-use trainer::{Method, ModelOptions, RenderRequest};
+use trainer::{Method, ModelOptions, Projection, RenderRequest};
 use viz::Hub;
 
 /// A wall of splats at y = 0 that faces -y. Without color coefficients of degree 3, which are not sent.
@@ -56,6 +56,8 @@ pub(crate) fn tsdf_model(n_keyframes: usize) -> TsdfModel {
 /// Models by method, and the requests so far.
 pub(crate) struct ModelThread {
     requests: Arc<Mutex<Vec<ReceivedRequest>>>,
+    /// Whether requests for depth alone fail.
+    refuses_depth: Arc<AtomicBool>,
     stop: Arc<AtomicBool>,
     thread: Option<std::thread::JoinHandle<Models>>,
 }
@@ -68,10 +70,15 @@ pub(crate) type Models = Vec<(&'static str, Box<dyn Method + Send>)>;
 impl ModelThread {
     pub(crate) fn start(hub: Hub, models: Models) -> Self {
         let requests: Arc<Mutex<Vec<ReceivedRequest>>> = Arc::default();
-        let stop: Arc<AtomicBool> = Arc::default();
-        let (received, stopped) = (Arc::clone(&requests), Arc::clone(&stop));
-        let thread = std::thread::spawn(move || serve(&hub, models, &received, &stopped));
-        Self { requests, stop, thread: Some(thread) }
+        let (refuses_depth, stop): (Arc<AtomicBool>, Arc<AtomicBool>) = Default::default();
+        let (received, refuses, stopped) = (Arc::clone(&requests), Arc::clone(&refuses_depth), Arc::clone(&stop));
+        let thread = std::thread::spawn(move || serve(&hub, models, &received, &refuses, &stopped));
+        Self { requests, refuses_depth, stop, thread: Some(thread) }
+    }
+
+    /// Lets requests for depth alone fail from now on.
+    pub(crate) fn refuse_depth(&self) {
+        self.refuses_depth.store(true, Ordering::Relaxed);
     }
 
     /// The newest request.
@@ -91,12 +98,26 @@ impl ModelThread {
     }
 }
 
-fn serve(hub: &Hub, mut models: Models, requests: &Mutex<Vec<ReceivedRequest>>, stop: &AtomicBool) -> Models {
+fn serve(
+    hub: &Hub,
+    mut models: Models,
+    requests: &Mutex<Vec<ReceivedRequest>>,
+    refuses_depth: &AtomicBool,
+    stop: &AtomicBool,
+) -> Models {
     while !stop.load(Ordering::Relaxed) {
         hub.wait_for_request(Duration::from_millis(20));
         if let Some(pending) = hub.next_request() {
+            let is_panorama = pending.request.projection == Projection::Equirectangular;
             let has_color = pending.packing().is_none_or(|packing| packing.jpeg_quality.is_some());
-            requests.lock().expect("no panic").push((pending.request.clone(), has_color));
+            // Panoramas are requested for the surroundings of a view.
+            if !is_panorama {
+                requests.lock().expect("no panic").push((pending.request.clone(), has_color));
+            }
+            if !has_color && refuses_depth.load(Ordering::Relaxed) {
+                pending.fail("");
+                continue;
+            }
             let name = pending.method().unwrap_or(models[0].0).to_owned();
             match models.iter_mut().find(|(other, _)| *other == name) {
                 Some((_, model)) => {

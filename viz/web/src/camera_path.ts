@@ -2,7 +2,7 @@
 
 import * as THREE from "three";
 
-const FRAMES_PER_SEC = 30;
+export const FRAMES_PER_SEC = 30;
 const SECS_PER_SEGMENT = 2;
 
 /** A view of an upright camera that looks at a point. */
@@ -49,18 +49,25 @@ export class CameraPath {
     return this.at(segments);
   }
 
+  /** The views of the playback, `FRAMES_PER_SEC` of them per second. */
+  frames(): PathView[] {
+    const nFrames = Math.round(this.seconds * FRAMES_PER_SEC) + 1;
+    return Array.from({ length: nFrames }, (_, ix) => this.at(ix / FRAMES_PER_SEC / SECS_PER_SEGMENT));
+  }
+
+  private get seconds(): number {
+    return Math.max(0, this.views.length - 1) * SECS_PER_SEGMENT;
+  }
+
   /** The path as a file for `fieldrig render --camera-path` and for nerfstudio. */
   file([width, height]: [number, number]): string {
-    const seconds = Math.max(0, this.views.length - 1) * SECS_PER_SEGMENT;
-    const nFrames = Math.round(seconds * FRAMES_PER_SEC) + 1;
-    const frames = Array.from({ length: nFrames }, (_, ix) => this.at(ix / FRAMES_PER_SEC / SECS_PER_SEGMENT));
     return JSON.stringify({
       camera_type: "perspective",
       render_width: width,
       render_height: height,
       fps: FRAMES_PER_SEC,
-      seconds,
-      camera_path: frames.map((view) => ({
+      seconds: this.seconds,
+      camera_path: this.frames().map((view) => ({
         camera_to_world: rowMajor(worldFromOpengl(view)),
         fov: view.fovDegrees,
         aspect: width / height,

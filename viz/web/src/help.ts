@@ -1,6 +1,13 @@
-// The list of keys, made from the titles of the buttons.
+// The list of keys, made from the titles of the buttons and the keys of the fly mode.
 
 import { element } from "./element";
+
+/** While flying, these keys have no other meaning. */
+const FLY_KEYS = [
+  ["W A S D", "Fly mode: forward, left, back, right. The arrow keys do the same"],
+  ["Q E", "Fly mode: down and up"],
+  ["Shift", "Fly mode: faster"],
+] as const;
 
 export function setUpHelp(): void {
   const dialog = element("help", HTMLDialogElement);
@@ -9,6 +16,7 @@ export function setUpHelp(): void {
       const match = /^(.*?) \((.)\)(.*)$/.exec(button.title);
       return match && !button.hidden ? [row(match[2]!, match[1]! + match[3]!)] : [];
     });
+    rows.push(...FLY_KEYS.map(([key, meaning]) => row(key, meaning)));
     element("keys").replaceChildren(...rows.flat());
     if (dialog.open) dialog.close();
     else dialog.showModal();

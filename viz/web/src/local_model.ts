@@ -49,9 +49,19 @@ export class LocalModel {
     return this.progress.nChunks > 0;
   }
 
+  /** Draws the depth of the splats, see splat_depth.ts. */
+  drawDepth(renderer: THREE.WebGLRenderer, camera: THREE.Camera, sizePx: [number, number]): THREE.Texture {
+    return this.splats.drawDepth(renderer, camera, sizePx);
+  }
+
   /** Whether the model is a mesh, which hides what lies behind it. */
   get hasDepth(): boolean {
     return this.meshes.root.children.length > 0;
+  }
+
+  /** The first surface of the drawn mesh on a ray: its distance and normal. */
+  hit(from: THREE.Vector3, direction: THREE.Vector3, maxM: number): { distance: number; normal: THREE.Vector3 } | null {
+    return this.root.visible ? this.meshes.hit(from, direction, maxM) : null;
   }
 
   /** Drops all chunks. The server sends them again after a new subscription. */

@@ -19,7 +19,9 @@ import { RenderScheduler } from "./render_scheduler";
 import { RobotAge } from "./robot_age";
 import { RunControls } from "./run_controls";
 import { ShownLatency } from "./shown_latency";
+import { SideView } from "./side_view";
 import { Subscriptions } from "./subscriptions";
+import { Surroundings } from "./surroundings";
 import { ViewSettings } from "./view_settings";
 
 let stages = [0.1, 0.5, 1];
@@ -65,6 +67,7 @@ const connection = new Connection(`${location.protocol === "https:" ? "wss" : "w
       robotAge.forget();
       scheduler.restart();
       shownLatency.forget();
+      for (const side of sides) side.restart();
       view.points.clear();
       view.scans.clear();
       view.scans.setPath([]);
@@ -89,12 +92,18 @@ const shownLatency = new ShownLatency(connection);
 const models = new ModelSwitch(() => {
   shownLatency.forget();
   scheduler.restart();
+  view.forgetSurfaces();
   if (latestStatus) showStatus(latestStatus);
 });
 let isDrawnLocally = false;
 const scheduler = new RenderScheduler(connection, () => view.view(), () => stages, BACKGROUND, () => models.method);
-
-const settings = new ViewSettings(view, scheduler);
+const sides = [new SideView(connection, "surroundings"), new SideView(connection, "video")] as const;
+const surroundings = new Surroundings(
+  sides[0],
+  (shown) => scheduler.picture(shown),
+  (map) => view.see("surroundings", map),
+);
+const settings = new ViewSettings(view, scheduler, sides[1]);
 
 function receiveText(message: TextMessage): void {
   switch (message.type) {
@@ -141,6 +150,7 @@ function receiveText(message: TextMessage): void {
       view.local.removed(message);
       break;
     case "error":
+      if (sides.some((side) => side.fail(message))) break;
       scheduler.failed(message.id);
       element("notice").textContent = message.message;
       break;
@@ -178,7 +188,7 @@ function showLocalProgress(): void {
 
 function receiveBinary(header: BinaryHeader, payload: Uint8Array<ArrayBuffer>): void {
   if (header.type === "picture") {
-    void showPicture(header, payload);
+    if (!sides.some((side) => side.receive(header, payload))) void showPicture(header, payload);
   } else if (header.type === "range_scan") {
     view.scans.show(header, payload);
     element("toggle-scans").hidden = false;
@@ -215,6 +225,7 @@ async function showPicture(header: PictureHeader, payload: Uint8Array<ArrayBuffe
   if (header.color && showsModel) shownLatency.pictureReady(header, receivedAt);
   else shownLatency.restart();
   view.changed();
+  view.seePicture();
   element("notice").textContent = "";
   if (!header.color) return;
   const [width, height] = header.size_px;
@@ -245,6 +256,7 @@ function action(id: string, key: string, act: () => void): void {
   });
 }
 
+toggle("toggle-fly", "y", (isOn) => (view.flies = isOn));
 action("reset-view", "r", () => view.reset());
 action("full-screen", "u", () => {
   if (document.fullscreenElement) void document.exitFullscreen();
@@ -302,6 +314,8 @@ function frame(): void {
   shownLatency.frameBegins();
   settings.tick();
   scheduler.tick();
+  // The first picture comes first.
+  if (view.picture.posedDepth && showsModel) surroundings.tick(view.view(), models.method);
   view.draw();
   requestAnimationFrame(frame);
 }

@@ -62,6 +62,15 @@ export class MeshLayer {
     for (const id of [...this.chunks.keys()]) this.remove(id);
   }
 
+  /** The first observed side of a surface on a ray: its distance, at most `maxM`, and its normal. */
+  hit(from: THREE.Vector3, direction: THREE.Vector3, maxM: number): { distance: number; normal: THREE.Vector3 } | null {
+    this.root.updateMatrixWorld();
+    const hits = new THREE.Raycaster(from, direction, 0, maxM).intersectObjects(this.root.children, false);
+    const hit = hits.find(({ point }) => this.planes.every((plane) => plane.distanceToPoint(point) >= 0));
+    if (!hit?.face) return null;
+    return { distance: hit.distance, normal: hit.face.normal.clone().transformDirection(hit.object.matrixWorld) };
+  }
+
   /** Draws only the part of the mesh in a box. */
   set crop(crop: Crop | undefined) {
     const axes = [0, 1, 2].map((axis) => new THREE.Vector3().setComponent(axis, 1));

@@ -1,4 +1,5 @@
-// Hides what lies behind the model: each fragment is compared with the depth of the newest picture at its own pixel.
+// Hides what lies behind the model: each fragment is compared with the depth of the newest picture at its own pixel, or
+// with the depth of the splats that the page draws.
 //
 // The comparison takes place in the camera of the picture. It is exact where the view and the picture agree, and close
 // to it while the next picture is pending.
@@ -27,8 +28,14 @@ const FRAGMENT = /* glsl */ `
   uniform vec2 occlusionFocalPx;
   uniform vec2 occlusionPrincipalPx;
   uniform bool occlusionIsOn;
+  uniform bool occlusionIsWeighted;
   uniform vec2 occlusionTolerance;
-  float depthAt(vec2 uv) { return texture2D(occlusionDepth, uv).r; }
+  float depthAt(vec2 uv) {
+    if (!occlusionIsWeighted) return texture2D(occlusionDepth, uv).r;
+    // Rendered textures begin at the bottom. Nearly transparent splats hide nothing.
+    vec2 sums = texture2D(occlusionDepth, vec2(uv.x, 1.0 - uv.y)).rg;
+    return sums.g > 0.5 ? sums.r / sums.g : 0.0;
+  }
   // The smaller of two differences: the change of depth along the surface, but not the step at its edge.
   float depthChange(float depth, float before, float after) {
     float a = before > 0.0 ? abs(before - depth) : 1e9;
@@ -50,7 +57,19 @@ const FRAGMENT = /* glsl */ `
     return p.z > depth * (1.0 + occlusionTolerance.x) + occlusionTolerance.y + change;
   }`;
 
-/** The picture that hides what lies behind it. */
+/** Depth and the camera that sees it. */
+export interface OcclusionDepth {
+  /** Depth in meters; stays the property of the caller. */
+  texture: THREE.Texture;
+  /** Whether the texture holds sums of weighted depths and of weights instead. */
+  isWeighted: boolean;
+  worldFromPicture: THREE.Matrix4;
+  sizePx: [number, number];
+  focalPx: [number, number];
+  principalPx: [number, number];
+}
+
+/** The depth that hides what lies behind it. */
 export class Occlusion {
   private readonly shared = {
     occlusionDepth: { value: null as THREE.Texture | null },
@@ -59,8 +78,10 @@ export class Occlusion {
     occlusionFocalPx: { value: new THREE.Vector2(1, 1) },
     occlusionPrincipalPx: { value: new THREE.Vector2() },
     occlusionIsOn: { value: false },
+    occlusionIsWeighted: { value: false },
   };
-  private hasPicture = false;
+  private pictured: OcclusionDepth | null = null;
+  private drawn: OcclusionDepth | null = null;
   private isOn = true;
   private isByDepthBuffer = false;
 
@@ -80,25 +101,28 @@ export class Occlusion {
     this.update();
   }
 
-  private update(): void {
-    this.shared.occlusionIsOn.value = this.isOn && this.hasPicture && !this.isByDepthBuffer;
+  /** Adopts the depth of the newest picture. */
+  set picture(depth: OcclusionDepth) {
+    this.pictured = depth;
+    this.update();
   }
 
-  /** Adopts the depth of a picture; `depth` stays the property of the caller. */
-  setPicture(
-    depth: THREE.Texture,
-    worldFromPicture: THREE.Matrix4,
-    sizePx: [number, number],
-    focalPx: [number, number],
-    principalPx: [number, number],
-  ): void {
-    this.shared.occlusionDepth.value = depth;
-    this.shared.pictureFromWorld.value.copy(worldFromPicture).invert();
-    this.shared.occlusionSizePx.value.fromArray(sizePx);
-    this.shared.occlusionFocalPx.value.fromArray(focalPx);
-    this.shared.occlusionPrincipalPx.value.fromArray(principalPx);
-    this.hasPicture = true;
+  /** Adopts the depth of the model that the page draws; null if it draws none, so that the picture's depth is used. */
+  set local(depth: OcclusionDepth | null) {
+    this.drawn = depth;
     this.update();
+  }
+
+  private update(): void {
+    const depth = this.drawn ?? this.pictured;
+    this.shared.occlusionIsOn.value = this.isOn && depth !== null && !this.isByDepthBuffer;
+    if (!depth) return;
+    this.shared.occlusionDepth.value = depth.texture;
+    this.shared.occlusionIsWeighted.value = depth.isWeighted;
+    this.shared.pictureFromWorld.value.copy(depth.worldFromPicture).invert();
+    this.shared.occlusionSizePx.value.fromArray(depth.sizePx);
+    this.shared.occlusionFocalPx.value.fromArray(depth.focalPx);
+    this.shared.occlusionPrincipalPx.value.fromArray(depth.principalPx);
   }
 
   /** Makes a material of three.js hide its occluded fragments. */

@@ -1,14 +1,17 @@
-// The main view: free camera, newest picture, lines on top.
+// The main view: free camera that orbits or flies, newest picture, lines on top.
 
 import * as THREE from "three";
 import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
 import { pinholeOfThreeCamera, poseOfThreeCamera, worldFromCamera } from "./convention";
 import type { PathView } from "./camera_path";
 import { CropBox } from "./crop_box";
+import { type DepthMap, PictureDepthMap } from "./depth_map";
+import { EyeGuard, type Stand } from "./eye_guard";
+import { FlyControls } from "./fly_controls";
 import { LocalModel } from "./local_model";
 import { MeasureTool } from "./measure";
 import { ObservationLayer } from "./observation_layer";
-import { Occlusion } from "./occlusion";
+import { Occlusion, type OcclusionDepth } from "./occlusion";
 import { Overlays } from "./overlays";
 import { PictureLayer } from "./picture_layer";
 import { PointsLayer } from "./points_layer";
@@ -20,6 +23,8 @@ import type { ServerClock } from "./server_clock";
 import { surfacePoint } from "./surface_picker";
 
 const VERTICAL_FOV_DEGREES = 50;
+/** Duration of the motion back to the front of a surface. */
+const RETURN_MILLIS = 250;
 /** The color --ground in app.css. */
 export const BACKGROUND: [number, number, number] = [0x0b / 255, 0x0e / 255, 0x13 / 255];
 
@@ -38,6 +43,12 @@ export class OrbitView {
   private readonly world = new THREE.Scene();
   private readonly renderer: THREE.WebGLRenderer;
   private readonly controls: OrbitControls;
+  private readonly fly: FlyControls;
+  private readonly guard = new EyeGuard((from, direction, maxM) => this.local.hit(from, direction, maxM));
+  /** The stand after the last motion. */
+  private readonly stand: Stand = { eye: new THREE.Vector3(), target: new THREE.Vector3() };
+  private isPlacing = false;
+  private returning: { from: Stand; to: Stand; began: number } | null = null;
   /** The part of the scene to draw. */
   readonly crop: CropBox;
   readonly measure: MeasureTool;
@@ -64,9 +75,10 @@ export class OrbitView {
     this.camera.up.set(0, 0, 1);
     this.camera.position.set(1, -1, 1);
     this.controls = new OrbitControls(this.camera, canvas);
-    this.controls.addEventListener("change", () => {
-      this.isStale = true;
-      onMove();
+    this.controls.addEventListener("change", () => this.moved());
+    this.fly = new FlyControls(this.camera, this.controls.target, canvas, () => {
+      this.hasUserMoved = true;
+      this.moved();
     });
     this.crop = new CropBox(this.camera, canvas, () => {
       this.isStale = true;
@@ -104,6 +116,8 @@ export class OrbitView {
     this.camera.updateProjectionMatrix();
     this.controls.minDistance = 2 * this.camera.near;
     this.controls.maxDistance = 12 * scene.radius_m;
+    this.guard.nearM = this.camera.near;
+    this.fly.radiusM = scene.radius_m;
     if (!this.hasUserMoved) this.reset();
   }
 
@@ -119,9 +133,7 @@ export class OrbitView {
     const forward = new THREE.Vector3().setFromMatrixColumn(pose, 2);
     const center = new THREE.Vector3(...(this.scene?.center_m ?? [0, 0, 0]));
     const along = Math.max(center.sub(eye).dot(forward), 0.2 * (this.scene?.radius_m ?? 1));
-    this.camera.position.copy(eye);
-    this.controls.target.copy(eye).addScaledVector(forward, along);
-    this.controls.update();
+    this.jump({ eye, target: eye.clone().addScaledVector(forward, along) });
   }
 
   /** Looks at the center of the scene from this direction. */
@@ -132,10 +144,8 @@ export class OrbitView {
     const distance = (1.15 * this.scene.radius_m) / Math.tan(halfAngle) / Math.min(1, this.camera.aspect);
     // Almost from above: exactly from above, the direction of "up" would be undefined.
     const from = direction === "top" ? new THREE.Vector3(0, -1e-3, 1) : new THREE.Vector3(0, -1, 0);
-    this.camera.position.copy(center).addScaledVector(from, distance);
-    this.controls.target.copy(center);
     this.hasUserMoved = true;
-    this.controls.update();
+    this.jump({ eye: center.clone().addScaledVector(from, distance), target: center });
   }
 
   /** Looks from the keyframe closest to the current view. */
@@ -155,11 +165,9 @@ export class OrbitView {
 
   /** Shows a view of the camera path. */
   showPathView(view: PathView): void {
-    this.camera.position.copy(view.position);
-    this.controls.target.copy(view.target);
     this.fovDegrees = view.fovDegrees;
     this.hasUserMoved = true;
-    this.controls.update();
+    this.jump({ eye: view.position, target: view.target });
   }
 
   /** The current view, for the camera path. */
@@ -174,6 +182,97 @@ export class OrbitView {
     this.camera.updateProjectionMatrix();
     this.isStale = true;
     this.onMove();
+  }
+
+  /** Whether the view flies instead of orbiting a point. */
+  set flies(flies: boolean) {
+    this.fly.enabled = flies;
+    this.controls.enabled = !flies;
+    // Both look at the target, which is where the surface is, so that an orbit begins without a jump.
+    const ahead = this.surfaceAt(0.5 * this.canvas.clientWidth, 0.5 * this.canvas.clientHeight);
+    const { position } = this.camera;
+    const distance = ahead?.distanceTo(position) ?? this.controls.target.distanceTo(position);
+    const forward = this.camera.getWorldDirection(new THREE.Vector3());
+    this.controls.target.copy(position).addScaledVector(forward, Math.max(distance, this.controls.minDistance));
+    this.moved();
+  }
+
+  /** Adopts newer knowledge of the model's surfaces, and returns to the front of them if the eye has passed one. */
+  see(name: string, map: DepthMap): void {
+    if (!this.isModelShown || this.returning) return;
+    const good = this.guard.see(name, map);
+    if (good) this.returning = { from: this.copyOfStand(), to: good, began: performance.now() };
+  }
+
+  /** Adopts the depth of a new picture. */
+  seePicture(): void {
+    const { posedDepth } = this.picture;
+    if (posedDepth) this.see("picture", new PictureDepthMap(posedDepth));
+  }
+
+  /** Forgets the surfaces of another model. */
+  forgetSurfaces(): void {
+    this.guard.forget();
+  }
+
+  /** Called after each motion by the user: stops before surfaces. */
+  private moved(): void {
+    if (this.isPlacing || this.returning) return;
+    const { position } = this.camera;
+    const { target } = this.controls;
+    if (position.equals(this.stand.eye) && target.equals(this.stand.target)) return;
+    const isShifted = !target.equals(this.stand.target);
+    const allowed = this.isModelShown ? this.guard.limit(position, isShifted) : position;
+    if (!allowed.equals(position)) {
+      // Eye and target move together in shifts; otherwise, the eye moves around the target or toward it.
+      if (isShifted) target.add(allowed).sub(position);
+      position.copy(allowed);
+      this.camera.lookAt(target);
+      if (position.equals(this.stand.eye) && target.equals(this.stand.target)) return;
+    }
+    this.guard.moved(this.adoptStand());
+    this.isStale = true;
+    this.onMove();
+  }
+
+  /** Looks from another place, which need not be reachable. */
+  private jump(stand: Stand): void {
+    this.returning = null;
+    this.place(stand);
+    this.guard.jump(this.stand, false);
+  }
+
+  private place({ eye, target }: Stand): void {
+    this.camera.position.copy(eye);
+    this.controls.target.copy(target);
+    this.isPlacing = true;
+    this.controls.update();
+    this.isPlacing = false;
+    this.adoptStand();
+    this.isStale = true;
+    this.onMove();
+  }
+
+  /** Moves back to the front of a surface, and ignores other motions meanwhile. */
+  private moveBack(): void {
+    if (!this.returning) return;
+    const { from, to, began } = this.returning;
+    const share = THREE.MathUtils.smoothstep((performance.now() - began) / RETURN_MILLIS, 0, 1);
+    const between = (get: (stand: Stand) => THREE.Vector3): THREE.Vector3 => get(from).clone().lerp(get(to), share);
+    this.place({ eye: between((stand) => stand.eye), target: between((stand) => stand.target) });
+    if (share < 1) return;
+    this.returning = null;
+    this.guard.jump(this.stand, true);
+  }
+
+  private adoptStand(): Stand {
+    this.stand.eye.copy(this.camera.position);
+    this.stand.target.copy(this.controls.target);
+    return this.stand;
+  }
+
+  private copyOfStand(): Stand {
+    return { eye: this.stand.eye.clone(), target: this.stand.target.clone() };
   }
 
   /** The point of the model's surface at a pixel of the canvas; null if there is none. */
@@ -235,6 +334,20 @@ export class OrbitView {
     };
   }
 
+  /** The current view from a place on the camera path. */
+  viewAlong({ position, target, fovDegrees }: PathView, [width, height]: [number, number]): View {
+    const camera = new THREE.PerspectiveCamera(fovDegrees, width / height);
+    camera.up.copy(this.camera.up);
+    camera.position.copy(position);
+    camera.lookAt(target);
+    return {
+      ...this.view(),
+      world_from_camera: poseOfThreeCamera(camera),
+      size_px: [width, height],
+      projection: pinholeOfThreeCamera(camera, [width, height]),
+    };
+  }
+
   /** Depth at which pixels without any model are placed. */
   get emptyDepth(): number {
     return 0.9 * this.camera.far;
@@ -253,6 +366,8 @@ export class OrbitView {
 
   /** Draws only if something has changed: on a robot's computer the page shares the cores with other programs. */
   draw(): void {
+    this.fly.update();
+    this.moveBack();
     if (!this.isStale) return;
     this.isStale = false;
     const view = this.view();
@@ -265,12 +380,25 @@ export class OrbitView {
     this.local.setView(view, [this.canvas.width, this.canvas.height]);
     const hasDepthBuffer = isLocal && this.local.hasDepth;
     this.occlusion.usesDepthBuffer = hasDepthBuffer;
+    this.occlusion.local = isLocal && !hasDepthBuffer && this.occlusion.enabled ? this.splatDepth(view) : null;
     this.crop.update();
     this.measure.update();
     this.renderer.clear();
     this.renderer.render(this.background, this.camera);
     if (!hasDepthBuffer || !this.occlusion.enabled) this.renderer.clearDepth();
     this.renderer.render(this.world, this.camera);
+  }
+
+  /** Draws the depth of the splats as seen in the view. */
+  private splatDepth(view: View): OcclusionDepth {
+    return {
+      texture: this.local.drawDepth(this.renderer, this.camera, [this.canvas.width, this.canvas.height]),
+      isWeighted: true,
+      worldFromPicture: worldFromCamera(view.world_from_camera),
+      sizePx: view.size_px,
+      focalPx: view.projection.focal_px,
+      principalPx: view.projection.principal_px,
+    };
   }
 
   private fit(): void {

@@ -10,7 +10,9 @@ export function panels(ids: Record<string, string>): (button: string) => void {
       const panel = element(id);
       const isOpen = button === pressed && panel.hidden;
       panel.hidden = !isOpen;
-      panel.style.top = `${toolbar.offsetTop + toolbar.offsetHeight + 6}px`; // The toolbar may have several rows.
+      const top = toolbar.offsetTop + toolbar.offsetHeight + 6; // The toolbar may have several rows.
+      panel.style.top = `${top}px`;
+      panel.style.maxHeight = `calc(100% - ${top + 12}px)`;
       element(button).setAttribute("aria-expanded", String(isOpen));
     }
   };

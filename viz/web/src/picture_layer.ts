@@ -5,8 +5,8 @@
 // of being stretched.
 
 import * as THREE from "three";
-import { decodeCompactDepth } from "./compact_depth";
 import { worldFromCamera } from "./convention";
+import { decodeDepth } from "./depth_part";
 import { type ObservationLayer, TINT } from "./observation_layer";
 import type { Occlusion } from "./occlusion";
 import type { DepthPart, PictureHeader } from "./protocol";
@@ -170,17 +170,15 @@ export class PictureLayer {
     uniforms.focalPx!.value.fromArray(header.projection.focal_px);
     uniforms.principalPx!.value.fromArray(header.projection.principal_px);
     uniforms.emptyDepth!.value = emptyDepth;
-    const { focal_px, principal_px } = header.projection;
-    this.occlusion.setPicture(depth, worldFromPicture, header.full_size_px, focal_px, principal_px);
-    const { data, width, height } = depth.image as { data: Float32Array; width: number; height: number };
-    this.posedDepth = {
+    const camera = {
       worldFromPicture,
       sizePx: header.full_size_px,
-      focalPx: focal_px,
-      principalPx: principal_px,
-      depth: data,
-      depthSizePx: [width, height],
+      focalPx: header.projection.focal_px,
+      principalPx: header.projection.principal_px,
     };
+    this.occlusion.picture = { texture: depth, isWeighted: false, ...camera };
+    const { data, width, height } = depth.image as { data: Float32Array; width: number; height: number };
+    this.posedDepth = { ...camera, depth: data, depthSizePx: [width, height] };
     this.enabled = this.isEnabled;
     return true;
   }
@@ -230,15 +228,8 @@ async function unpackDepth(
   payload: Uint8Array<ArrayBuffer>,
 ): Promise<THREE.DataTexture> {
   if (!part) return depthTexture(new Float32Array(1), 1, 1);
-  const [width, height] = part.size_px;
-  // The parts are packed without padding; a copy gives them the alignment that typed arrays need.
-  const bytes = payload.slice(part.offset, part.offset + part.bytes);
-  if (part.format === "compact_half") {
-    return depthTexture(await decodeCompactDepth(bytes, part.size_px, part.min_m, part.log_step), width, height);
-  }
-  const counts = part.format === "f32" ? new Float32Array(bytes.buffer) : new Uint16Array(bytes.buffer);
-  const depth = Float32Array.from(counts, (count) => count * part.meters_per_count);
-  return depthTexture(depth, width, height);
+  const { depth, sizePx } = await decodeDepth(part, payload);
+  return depthTexture(depth, ...sizePx);
 }
 
 function replaceTexture(slot: THREE.IUniform, texture: THREE.Texture): void {

@@ -29,6 +29,8 @@ export interface Pinhole {
   principal_px: [number, number];
 }
 
+export type Projection = Pinhole | { kind: "equirectangular" };
+
 /** What the page may do; only operators can change the run. */
 export type Role = "viewer" | "operator";
 
@@ -211,7 +213,7 @@ export interface PictureHeader {
   size_px: [number, number];
   full_size_px: [number, number];
   world_from_camera: number[];
-  projection: Pinhole | { kind: "equirectangular" };
+  projection: Projection;
   near_m: number;
   far_m: number;
   waited_millis: number;
@@ -384,10 +386,12 @@ export interface ControlMessage {
 export interface RenderMessage {
   type: "render";
   id: number;
+  /** Name of the view; the main view has none. */
+  view?: string;
   method?: string | undefined;
   world_from_camera: number[];
   size_px: [number, number];
-  projection: Pinhole;
+  projection: Projection;
   stages: number[];
   near_m: number;
   far_m: number;

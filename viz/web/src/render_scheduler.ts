@@ -6,6 +6,7 @@
 import type { Connection } from "./connection";
 import type { Crop } from "./crop_box";
 import type { PictureHeader, Pinhole, RenderMessage } from "./protocol";
+import type { PictureRequest } from "./side_view";
 
 /** The current view of the page. */
 export interface View {
@@ -124,17 +125,18 @@ export class RenderScheduler {
     this.requestedAt = performance.now();
     this.isWaiting = true;
     this.hasUpdate = false;
-    const message: RenderMessage = {
-      type: "render",
-      id: this.id,
+    const outputs: RenderMessage["outputs"] = this.isLocal ? ["depth"] : ["color", "depth"];
+    this.connection.send({ type: "render", id: this.id, ...this.picture(this.view()), stages, outputs });
+  }
+
+  /** What pictures of a view have in common with those of the main view. */
+  picture(view: View): Omit<PictureRequest, "outputs"> {
+    return {
+      ...view,
       method: this.method(), // Omitted from the message if undefined.
-      ...this.view(),
-      stages,
-      outputs: this.isLocal ? ["depth"] : ["color", "depth"],
       depth_format: this.connection.supports("compact_depth") ? "compact_half" : undefined,
       background_srgb: this.background,
     };
-    this.connection.send(message);
   }
 
   private adapt(millis: number): void {

@@ -4,6 +4,7 @@ import * as THREE from "three";
 import type { Crop } from "./crop_box";
 import type { ObservationLayer } from "./observation_layer";
 import type { SplatChunkHeader } from "./protocol";
+import { SplatDepth } from "./splat_depth";
 import { SplatMemory } from "./splat_memory";
 import { SPLAT_FRAGMENT, SPLAT_VERTEX } from "./splat_shader";
 import type { FreeUnits, SetChunk, Sort, SortResult } from "./splat_sorter";
@@ -12,6 +13,7 @@ const FAR_AWAY = 1e9;
 
 export class SplatLayer {
   readonly mesh: THREE.Mesh<THREE.InstancedBufferGeometry, THREE.RawShaderMaterial>;
+  private readonly depth: SplatDepth;
   private readonly memory = new SplatMemory();
   private readonly units = new Map<number, number[]>();
   private worker: Worker | null = null;
@@ -58,6 +60,7 @@ export class SplatLayer {
     });
     this.mesh = new THREE.Mesh(geometry, material);
     this.mesh.frustumCulled = false;
+    this.depth = new SplatDepth(material);
     this.crop = undefined;
   }
 
@@ -119,6 +122,11 @@ export class SplatLayer {
     (uniforms.principalPx!.value as THREE.Vector2).set(0.5 * width, 0.5 * height);
     (uniforms.depthRange!.value as THREE.Vector2).set(nearM, farM);
     this.requestOrder(cameraFromModel.elements);
+  }
+
+  /** Draws the depth of the view, see splat_depth.ts. */
+  drawDepth(renderer: THREE.WebGLRenderer, camera: THREE.Camera, sizePx: [number, number]): THREE.Texture {
+    return this.depth.draw(renderer, this.mesh, camera, sizePx);
   }
 
   /** Sorts the splats unless they are sorted for this view. Sorts once more later if the view changes meanwhile. */

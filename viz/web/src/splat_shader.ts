@@ -33,6 +33,7 @@ export const SPLAT_VERTEX = /* glsl */ `
   out vec2 deviations;
   flat out vec4 color;
   flat out float reach;
+  flat out float depth;
 ${TINT}
 
   const float MIN_ALPHA = 1.0 / 255.0;
@@ -115,6 +116,7 @@ ${TINT}
       + along * lengths.x * deviations.x + vec2(-along.y, along.x) * lengths.y * deviations.y;
     gl_Position = vec4(2.0 * px.x / sizePx.x - 1.0, 1.0 - 2.0 * px.y / sizePx.y, 0.0, 1.0);
 
+    depth = point.z;
     vec3 rgb = vec3(uvec3(words.w >> 8u, words.w >> 16u, words.w >> 24u) & 255u) / 127.5 - 0.5;
     if (steps.y > 0.0 || steps.z > 0.0) {
       rgb += viewDependent(texelFetch(harmonics, texel, 0), steps.yz, normalize(mean - eyeInModel));
@@ -127,10 +129,15 @@ export const SPLAT_FRAGMENT = /* glsl */ `
   in vec2 deviations;
   flat in vec4 color;
   flat in float reach;
+  flat in float depth;
   out vec4 blended;
   void main() {
     float square = dot(deviations, deviations);
     if (square > reach) discard;
     float alpha = min(0.999, color.a * exp(-0.5 * square));
+#ifdef WRITES_DEPTH
+    blended = vec4(depth * alpha, alpha, 0.0, alpha);
+#else
     blended = vec4(color.rgb * alpha, alpha);
+#endif
   }`;

@@ -44,7 +44,7 @@ export function surfacePoint(ray: Ray, posed: PosedDepth, nearM: number, farM: n
 }
 
 /** Depth of the pixel onto which a point projects; 0 if there is none. */
-function depthAt(posed: PosedDepth, inPicture: Vector3): number {
+export function depthAt(posed: PosedDepth, inPicture: Vector3): number {
   if (inPicture.z <= 0) return 0;
   const uv = [inPicture.x, inPicture.y].map(
     (value, axis) =>

@@ -3,16 +3,24 @@
 import { CameraPath } from "./camera_path";
 import { element } from "./element";
 import type { OrbitView } from "./orbit_view";
+import { PathVideo, whyNoVideo } from "./path_video";
 import type { RenderScheduler } from "./render_scheduler";
+import type { SideView } from "./side_view";
 
 export class ViewSettings {
   private readonly path = new CameraPath();
   private readonly fov = element("fov", HTMLInputElement);
+  private readonly video: PathVideo;
 
   constructor(
     private readonly view: OrbitView,
     scheduler: RenderScheduler,
+    side: SideView,
   ) {
+    this.video = new PathVideo(side, (along, sizePx) => ({
+      ...scheduler.picture(view.viewAlong(along, sizePx)),
+      outputs: ["color"],
+    }));
     this.onInput("fov", (value) => (view.fovDegrees = value));
     this.onInput("opacity", (value) => {
       view.picture.opacity = value / 100;
@@ -31,6 +39,10 @@ export class ViewSettings {
       this.edit(() => (this.path.isPlaying ? this.path.stop() : this.path.play())),
     );
     element("path-save").addEventListener("click", () => this.save());
+    element("path-video").addEventListener("click", () => {
+      if (this.video.isRecording) this.video.cancel();
+      else void this.record();
+    });
     // A user who takes over ends the playback.
     element("canvas").addEventListener("pointerdown", () => this.edit(() => this.path.stop()));
     this.edit(() => undefined);
@@ -56,9 +68,11 @@ export class ViewSettings {
   private edit(change: () => void): void {
     change();
     const { nViews, isPlaying } = this.path;
-    element("path-count").textContent = nViews === 1 ? "1 view" : `${nViews} views`;
+    if (!this.video.isRecording) element("path-count").textContent = nViews === 1 ? "1 view" : `${nViews} views`;
     element("path-play").textContent = isPlaying ? "Stop" : "Play";
     for (const id of ["path-play", "path-save"]) element(id, HTMLButtonElement).disabled = nViews < 2;
+    element("path-video").textContent = this.video.isRecording ? "Cancel" : "Video";
+    element("path-video", HTMLButtonElement).disabled = nViews < 2 && !this.video.isRecording;
     element("path-clear", HTMLButtonElement).disabled = nViews === 0;
     const fov = Math.round(this.view.pathView().fovDegrees);
     if (this.fov.valueAsNumber !== fov) {
@@ -68,11 +82,33 @@ export class ViewSettings {
   }
 
   private save(): void {
-    const file = new Blob([this.path.file(this.view.view().size_px)], { type: "application/json" });
-    const link = document.createElement("a");
-    link.href = URL.createObjectURL(file);
-    link.download = "camera_path.json";
-    link.click();
-    URL.revokeObjectURL(link.href);
+    download(new Blob([this.path.file(this.view.view().size_px)], { type: "application/json" }), "camera_path.json");
   }
+
+  private async record(): Promise<void> {
+    const [notice, count] = [element("notice"), element("path-count")];
+    const reason = whyNoVideo();
+    notice.textContent = reason ?? "";
+    if (reason) return;
+    const frames = this.path.frames();
+    try {
+      const recording = this.video.record(frames, this.view.view().size_px, (nDone) => {
+        count.textContent = nDone < frames.length ? `picture ${nDone + 1} of ${frames.length}` : "writing";
+      });
+      this.edit(() => undefined);
+      const file = await recording;
+      if (file) download(file, "camera_path.mp4");
+    } catch (error) {
+      notice.textContent = `Cannot record a video: ${error instanceof Error ? error.message : String(error)}`;
+    }
+    this.edit(() => undefined);
+  }
+}
+
+function download(file: Blob, name: string): void {
+  const link = document.createElement("a");
+  link.href = URL.createObjectURL(file);
+  link.download = name;
+  link.click();
+  URL.revokeObjectURL(link.href);
 }

@@ -1,0 +1,77 @@
+// Depth of the model as seen from a point, in one picture or in all directions.
+
+import { type Matrix4, Vector3 } from "three";
+import { type PosedDepth, depthAt } from "./surface_picker";
+
+/** Free space around a point, as far as it is known. */
+export interface DepthMap {
+  /** The point from which the surfaces were seen. */
+  readonly origin: Vector3;
+  /** Whether surfaces are known in all directions. */
+  readonly isComplete: boolean;
+  /** How far a point lies in front of the surface in its direction, meters: negative behind it, infinite if there is none. */
+  clearance(point: Vector3): number;
+  /** Whether most surfaces around the origin are closer than this. */
+  isWithin(distanceM: number): boolean;
+}
+
+/** The part of the model in a picture. */
+export class PictureDepthMap implements DepthMap {
+  readonly origin: Vector3;
+  readonly isComplete = false;
+  private readonly pictureFromWorld: Matrix4;
+
+  constructor(private readonly posed: PosedDepth) {
+    this.origin = new Vector3().setFromMatrixPosition(posed.worldFromPicture);
+    this.pictureFromWorld = posed.worldFromPicture.clone().invert();
+  }
+
+  clearance(point: Vector3): number {
+    const inPicture = point.clone().applyMatrix4(this.pictureFromWorld);
+    const surface = depthAt(this.posed, inPicture);
+    return surface > 0 ? surface - inPicture.z : Infinity;
+  }
+
+  isWithin(): boolean {
+    return false; // A picture may show a single object.
+  }
+}
+
+/** The model in all directions, from an equirectangular picture. */
+export class PanoramaDepthMap implements DepthMap {
+  readonly origin: Vector3;
+  readonly isComplete = true;
+  private readonly pictureFromWorld: Matrix4;
+
+  constructor(
+    worldFromPicture: Matrix4,
+    private readonly depth: Float32Array,
+    private readonly sizePx: [number, number],
+  ) {
+    this.origin = new Vector3().setFromMatrixPosition(worldFromPicture);
+    this.pictureFromWorld = worldFromPicture.clone().invert();
+  }
+
+  clearance(point: Vector3): number {
+    const { x, y, z } = point.clone().applyMatrix4(this.pictureFromWorld);
+    const distance = Math.hypot(x, y, z);
+    if (distance === 0) return Infinity;
+    const [width, height] = this.sizePx;
+    const column = Math.min(width - 1, Math.floor((0.5 + Math.atan2(x, z) / (2 * Math.PI)) * width));
+    const row = Math.min(height - 1, Math.floor((0.5 + Math.asin(y / distance) / Math.PI) * height));
+    const surface = this.depth[row * width + column] ?? 0;
+    return surface > 0 ? surface - distance : Infinity;
+  }
+
+  isWithin(distanceM: number): boolean {
+    const [width, height] = this.sizePx;
+    let near = 0;
+    let all = 0;
+    this.depth.forEach((depth, ix) => {
+      const area = Math.cos(((Math.floor(ix / width) + 0.5) / height - 0.5) * Math.PI);
+      all += area;
+      if (depth > 0 && depth < distanceM) near += area;
+    });
+    return near > 0.5 * all;
+  }
+}

@@ -1,0 +1,58 @@
+// Draws the depth of splats, so that they hide objects behind them: the mean depth of the splats at each pixel, weighted
+// like their colors, as on the server.
+
+import * as THREE from "three";
+import { SPLAT_FRAGMENT, SPLAT_VERTEX } from "./splat_shader";
+
+/** Size relative to the view, as for depth from the server. */
+const SCALE = 0.5;
+
+export class SplatDepth {
+  private target: THREE.WebGLRenderTarget | null = null;
+  private readonly material: THREE.RawShaderMaterial;
+
+  /** Draws with the uniforms of the material for colors. */
+  constructor(colors: THREE.RawShaderMaterial) {
+    this.material = colors.clone();
+    this.material.uniforms = colors.uniforms;
+    this.material.vertexShader = SPLAT_VERTEX;
+    this.material.fragmentShader = SPLAT_FRAGMENT;
+    this.material.defines = { WRITES_DEPTH: 1 };
+  }
+
+  /** Draws the splats of a mesh. The texture holds the sum of the weighted depths, meters, and of the weights. */
+  draw(
+    renderer: THREE.WebGLRenderer,
+    mesh: THREE.Mesh<THREE.InstancedBufferGeometry, THREE.RawShaderMaterial>,
+    camera: THREE.Camera,
+    sizePx: [number, number],
+  ): THREE.Texture {
+    const [width, height] = sizePx.map((side) => Math.ceil(SCALE * side)) as [number, number];
+    this.target ??= depthTarget(renderer);
+    this.target.setSize(width, height);
+    const colors = mesh.material;
+    const clearColor = renderer.getClearColor(new THREE.Color());
+    const clearAlpha = renderer.getClearAlpha();
+    mesh.material = this.material;
+    renderer.setRenderTarget(this.target);
+    renderer.setClearColor(0, 0);
+    renderer.clear();
+    renderer.render(mesh, camera);
+    renderer.setRenderTarget(null);
+    renderer.setClearColor(clearColor, clearAlpha);
+    mesh.material = colors;
+    return this.target.texture;
+  }
+}
+
+/** Floats of 32 bits if the GPU can blend them; those of 16 bits have an error of 0.05 % per splat. */
+function depthTarget(renderer: THREE.WebGLRenderer): THREE.WebGLRenderTarget {
+  const hasFloatBlend = renderer.extensions.has("EXT_color_buffer_float") && renderer.extensions.has("EXT_float_blend");
+  return new THREE.WebGLRenderTarget(1, 1, {
+    format: THREE.RGFormat,
+    type: hasFloatBlend ? THREE.FloatType : THREE.HalfFloatType,
+    magFilter: THREE.NearestFilter,
+    minFilter: THREE.NearestFilter,
+    depthBuffer: false,
+  });
+}
