@@ -80,6 +80,8 @@ pub struct Live {
     is_paused: bool,
     /// Result of the last checkpoint that an operator requested.
     checkpoint_note: Option<String>,
+    /// What the last edit did.
+    edit_note: Option<String>,
     chunk_publisher: ChunkPublisher,
 }
 
@@ -112,6 +114,7 @@ impl Live {
             keyframe_change: None,
             is_paused: false,
             checkpoint_note: None,
+            edit_note: None,
         }
     }
 
@@ -212,6 +215,7 @@ impl Live {
     /// Runs one cycle: takes keyframes, trains, draws and publishes. Reopens the GPU if it fails.
     pub fn advance(&mut self) -> crate::Result<()> {
         self.apply_controls();
+        self.apply_edits();
         let advanced = self
             .take_keyframes()
             .and_then(|()| self.step())
@@ -255,6 +259,31 @@ impl Live {
                 }
             }
         }
+    }
+
+    /// Applies the edits that operators have requested.
+    fn apply_edits(&mut self) {
+        for request in self.hub.take_edits() {
+            let Some(session_ix) = session_for_method(&self.sessions, request.method()) else {
+                let reason = self.unknown_method(request.method());
+                self.hub.reject_edit(&request, &reason);
+                continue;
+            };
+            match self.sessions[session_ix].edit(request.action()) {
+                Ok(note) => {
+                    self.edit_note = Some(note);
+                    self.published = None; // Viewers wait for the new status.
+                }
+                Err(error) => self.hub.reject_edit(&request, &error.to_string()),
+            }
+        }
+    }
+
+    /// Why there is no model of this method.
+    fn unknown_method(&self, method: Option<&str>) -> String {
+        let available_methods =
+            self.sessions.iter().map(|session| session.kind().name()).collect::<Vec<_>>().join(" or ");
+        format!("no model with the method {:?}; use {available_methods}", method.unwrap_or_default())
     }
 
     /// Pushes new keyframes to the models: all waiting keyframes in real time, or the keyframe that is due in lockstep.
@@ -433,19 +462,18 @@ impl Live {
     /// Starts to draw the next requested picture. Requests that cannot be drawn are answered.
     fn queue_picture(&mut self) -> Option<QueuedRender> {
         loop {
-            let pending = self.hub.next_request()?;
+            let mut pending = self.hub.next_request()?;
             if self.keyframes.is_empty() {
                 pending.fail("no keyframe yet");
                 continue;
             }
             let Some(session_ix) = session_for_method(&self.sessions, pending.method()) else {
-                let available_methods =
-                    self.sessions.iter().map(|session| session.kind().name()).collect::<Vec<_>>().join(" or ");
-                let requested = pending.method().unwrap_or_default().to_owned();
-                pending.fail(&format!("no model with the method {requested:?}; use {available_methods}"));
+                let reason = self.unknown_method(pending.method());
+                pending.fail(&reason);
                 continue;
             };
             let session = &mut self.sessions[session_ix];
+            pending.request.edits = Arc::clone(session.edits());
             let queued = session.queue_picture(&pending.request, pending.packing());
             let n_keyframes = self.ledger.n_in_model(session.progress().step);
             return Some(QueuedRender { pending: pending.of_keyframes(n_keyframes as u64), session_ix, queued });
@@ -506,7 +534,7 @@ impl Live {
                 self.notes.clone(),
                 self.device_notes.list(),
                 movements.iter().map(ToString::to_string).collect(),
-                self.checkpoint_note.iter().cloned().collect(),
+                [&self.checkpoint_note, &self.edit_note].into_iter().flatten().cloned().collect(),
             ]
             .concat(),
             ..Status::default()
@@ -637,6 +665,7 @@ fn model_status(session: &Session) -> ModelStatus {
         primitives_label: session.kind().entry().primitives_label.to_owned(),
         bytes: progress.bytes,
         has_chunks: session.kind().entry().has_chunks,
+        edits: session.edits().len(),
         psnr: session.psnr(),
         psnr_history: session.psnr_history().to_vec(),
     }

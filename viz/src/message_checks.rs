@@ -1,13 +1,15 @@
 //! Checks the messages of viewers: every accepted request must be safe to render, and every accepted subscription must
 //! keep its limits. The fuzz target `page` calls it.
 
+use crate::edit::{EditAction, EditRequest};
 use crate::negotiation::{CAPABILITIES, negotiate};
 use crate::protocol::{
-    BASE_PROTOCOL_VERSION, ClientHello, ClientMessage, MAX_RATE_HZ, PROTOCOL_VERSION, RenderMessage, SubscribeMessage,
+    BASE_PROTOCOL_VERSION, ClientHello, ClientMessage, EditMessage, MAX_RATE_HZ, PROTOCOL_VERSION, RenderMessage,
+    SubscribeMessage,
 };
 use crate::subscriptions::{Subscriptions, fitted};
 use crate::view_request::{MAX_SIZE_PX, ViewRequest};
-use trainer::{Projection, RenderRequest};
+use trainer::{Aabb, Projection, RenderRequest};
 
 /// Handles the messages of a session, one per line, and panics if a result is inconsistent.
 pub(crate) fn check_session(session: &str) {
@@ -17,6 +19,7 @@ pub(crate) fn check_session(session: &str) {
             Ok(ClientMessage::Hello(hello)) => check_hello(&hello),
             Ok(ClientMessage::Render(message)) => check_render(&message),
             Ok(ClientMessage::Subscribe(message)) => check_subscription(&mut subscriptions, message),
+            Ok(ClientMessage::Edit(message)) => check_edit(&message),
             Ok(ClientMessage::Control(_) | ClientMessage::Ping(_) | ClientMessage::Goodbye(_)) | Err(_) => {}
         }
     }
@@ -42,6 +45,14 @@ fn check_render(message: &RenderMessage) {
         if let Projection::Pinhole { focal_px, principal_px } = projection {
             assert!(focal_px.iter().chain(&principal_px).all(|number| number.is_finite()));
         }
+    }
+}
+
+fn check_edit(message: &EditMessage) {
+    let Ok(request) = EditRequest::check(1, message) else { return };
+    if let EditAction::Erase(Aabb { world_from_box, min_m, max_m }) = request.action() {
+        assert!(kinematics::transform::is_finite(world_from_box));
+        assert!(min_m.iter().zip(max_m).all(|(min, max)| min < max && min.is_finite() && max.is_finite()));
     }
 }
 

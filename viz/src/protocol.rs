@@ -31,6 +31,8 @@ pub(crate) enum ClientMessage {
     Subscribe(SubscribeMessage),
     /// Controls the run.
     Control(ControlMessage),
+    /// Edits a model.
+    Edit(EditMessage),
     /// Requests the server's time.
     Ping(ClientPing),
     /// The client disconnects.
@@ -42,7 +44,7 @@ impl ClientMessage {
     pub(crate) fn required_role(&self) -> Role {
         match self {
             Self::Hello(_) | Self::Render(_) | Self::Subscribe(_) | Self::Ping(_) | Self::Goodbye(_) => Role::Viewer,
-            Self::Control(_) => Role::Operator,
+            Self::Control(_) | Self::Edit(_) => Role::Operator,
         }
     }
 }
@@ -119,6 +121,33 @@ pub enum Control {
     Save,
 }
 
+/// Fields of `edit`.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct EditMessage {
+    /// What to do.
+    pub(crate) action: EditKind,
+    /// The box to erase.
+    #[serde(rename = "box")]
+    pub(crate) erased_box: Option<BoxMessage>,
+    /// The model to edit; the first if absent.
+    pub(crate) method: Option<String>,
+    /// Number chosen by the client, repeated in the reply if the edit fails.
+    pub(crate) id: Option<u64>,
+}
+
+/// Kinds of edits.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub(crate) enum EditKind {
+    /// Erases the part of the model in a box.
+    Erase,
+    /// Erases small unconnected parts.
+    RemoveFloaters,
+    /// Undoes the last edit.
+    Undo,
+}
+
 /// Fields of `ping`.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -155,7 +184,7 @@ pub(crate) struct RenderMessage {
     /// Far limit along z.
     pub(crate) far_m: Option<f64>,
     /// Box outside which the scene is not rendered.
-    pub(crate) crop: Option<CropMessage>,
+    pub(crate) crop: Option<BoxMessage>,
     /// Requested outputs.
     pub(crate) outputs: Option<Vec<Output>>,
     /// Encoding of depth; used only with the output `depth`.
@@ -187,7 +216,7 @@ pub(crate) enum ProjectionMessage {
 /// A box with sides along the axes of its frame.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(crate) struct CropMessage {
+pub(crate) struct BoxMessage {
     /// Row major; aligned with the world axes if absent.
     pub(crate) world_from_box: Option<[f64; 16]>,
     /// Minimum corner.

@@ -70,6 +70,8 @@ pub(crate) enum Outgoing {
     Picture(Box<(RenderJob, PictureHeader, Rendered)>),
     /// A stage that could not be rendered.
     Failed { id: u64, view: Arc<str>, reason: String },
+    /// An edit that could not be made.
+    Rejected { id: Option<u64>, reason: String },
 }
 
 impl Queue {

@@ -3,7 +3,8 @@
 use crate::Hub;
 use crate::access::Role;
 use crate::admission::Connection;
-use crate::hub::Demand;
+use crate::edit::EditRequest;
+use crate::hub::{Demand, MAX_WAITING_EDITS};
 use crate::link_rate::LinkRate;
 use crate::negotiation::{Negotiated, negotiate};
 use crate::protocol::{ClientMessage, ControlMessage, SubscribeMessage};
@@ -145,6 +146,14 @@ impl Reader<'_> {
             ClientMessage::Control(ControlMessage { action }) => {
                 log::info!("client {}: {action:?}", self.client);
                 self.hub.control(action);
+                None
+            }
+            ClientMessage::Edit(message) => {
+                let request = EditRequest::check(self.client, &message)?;
+                log::info!("client {}: {:?}", self.client, request.action());
+                if !self.hub.edit(request) {
+                    return Err(InvalidRequest::Edits { max: MAX_WAITING_EDITS });
+                }
                 None
             }
             ClientMessage::Ping(ping) => Some(Reply::Pong { t: ping.t }),

@@ -3,6 +3,7 @@
 import { keepToken, showRole } from "./access";
 import { Banner } from "./banner";
 import { Connection } from "./connection";
+import { EditControls } from "./edit_controls";
 import { element } from "./element";
 import { showGuidance } from "./guidance";
 import { setUpHelp } from "./help";
@@ -78,6 +79,7 @@ const models = new ModelSwitch(() => {
 let isDrawnLocally = false;
 const scheduler = new RenderScheduler(connection, () => view.view(), () => stages, BACKGROUND, () => models.method);
 
+const edits = new EditControls(connection, view.crop, () => models.method);
 const settings = new ViewSettings(view, scheduler);
 
 function receiveText(message: TextMessage): void {
@@ -125,6 +127,7 @@ function receiveText(message: TextMessage): void {
       view.local.removed(message);
       break;
     case "error":
+      if (edits.failed(message)) break;
       scheduler.failed(message.id);
       element("notice").textContent = message.message;
       break;
@@ -139,7 +142,8 @@ function receiveText(message: TextMessage): void {
 function showStatus(status: Status): void {
   const model = models.shown(status);
   readouts.show(status, model);
-  if (model.step !== latestStep) scheduler.modelChanged();
+  const isEdited = edits.show(model);
+  if (model.step !== latestStep || isEdited) scheduler.modelChanged();
   latestStep = model.step;
   updateLocalModel(model);
 }
@@ -254,9 +258,20 @@ toggle("toggle-images", "i", (isOn) => {
   element("live").hidden = !isOn;
   subscriptions.images = isOn;
 });
-const togglePanel = panels({ "toggle-layers": "layers", "toggle-settings": "settings" });
+const switchPanel = panels({ "toggle-layers": "layers", "toggle-settings": "settings", "toggle-edit": "edit" });
+const togglePanel = (button: string): void => {
+  switchPanel(button);
+  edits.opened();
+};
 action("toggle-layers", "e", () => togglePanel("toggle-layers"));
 action("toggle-settings", "v", () => togglePanel("toggle-settings"));
+action("toggle-edit", "q", () => {
+  const button = element("toggle-edit", HTMLButtonElement);
+  if (!button.hidden && !button.disabled) togglePanel("toggle-edit");
+});
+action("erase-box", "w", () => edits.eraseBox());
+action("remove-floaters", "a", () => edits.removeFloaters());
+action("undo-edit", "z", () => edits.undoLast());
 toggle("toggle-follow", "l", (isOn) => (view.follows = isOn));
 toggle("toggle-points", "p", (isOn) => {
   view.points.enabled = isOn;

@@ -17,6 +17,7 @@ export const CAPABILITIES = [
   "range_scans",
   "base_path",
   "control",
+  "edit",
   "model_chunks",
 ] as const;
 export type Capability = (typeof CAPABILITIES)[number];
@@ -62,6 +63,8 @@ export interface ModelStatus {
   bytes: number;
   /** Whether the page can draw the model itself; missing on older servers. */
   has_chunks: boolean;
+  /** Number of edits that can be undone; missing on older servers. */
+  edits?: number;
   psnr: number | null;
   psnr_history: [number, number][];
 }
@@ -361,6 +364,15 @@ export interface ControlMessage {
   action: "pause" | "resume" | "save";
 }
 
+/** Erases parts of a model, or undoes this. */
+export interface EditMessage {
+  type: "edit";
+  id: number;
+  action: "erase" | "remove_floaters" | "undo";
+  box?: { min_m: [number, number, number]; max_m: [number, number, number] };
+  method?: string | undefined;
+}
+
 export interface RenderMessage {
   type: "render";
   id: number;
@@ -382,7 +394,13 @@ export interface PingMessage {
   t: number;
 }
 
-export type ClientMessage = HelloMessage | RenderMessage | SubscribeMessage | ControlMessage | PingMessage;
+export type ClientMessage =
+  | HelloMessage
+  | RenderMessage
+  | SubscribeMessage
+  | ControlMessage
+  | EditMessage
+  | PingMessage;
 
 /** Header and payload of a binary message: u32 little-endian header length, JSON header, payload. */
 export function unframe(message: ArrayBuffer): {
