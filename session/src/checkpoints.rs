@@ -10,8 +10,8 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
-use trainer::Method;
 use trainer::checkpoint::{Checkpoint, PendingCheckpoint};
+use trainer::{Edits, Method};
 
 /// Default time between two checkpoints.
 const DEFAULT_PERIOD: Duration = Duration::from_secs(60);
@@ -106,6 +106,8 @@ pub struct Snapshot<'a> {
     pub method: &'a mut dyn Method,
     /// All keyframes in the store, including test keyframes.
     pub keyframes: &'a [Arc<Keyframe>],
+    /// Erased space.
+    pub edits: &'a Edits,
     /// Training time, seconds.
     pub seconds: f64,
     /// Whether training has reached its limit.
@@ -190,6 +192,7 @@ impl Checkpoints {
             pending,
             seconds: now.seconds,
             is_finished: now.is_finished,
+            edits: now.edits.clone(),
             run_flags: self.run_flags.clone(),
             path: self.path.clone(),
             keyframes: self.stored_keyframes.clone().map(|stored| (stored, now.keyframes.to_vec())),
@@ -245,6 +248,7 @@ pub struct CheckpointWrite {
     pending: PendingCheckpoint,
     seconds: f64,
     is_finished: bool,
+    edits: Edits,
     run_flags: RunFlags,
     path: PathBuf,
     keyframes: Option<(StoredKeyframes, Vec<Arc<Keyframe>>)>,
@@ -258,8 +262,8 @@ impl CheckpointWrite {
         if let Some((stored, keyframes)) = &self.keyframes {
             stored.add(keyframes)?;
         }
-        let (seconds, is_finished) = (self.seconds, self.is_finished);
-        Checkpoint { seconds, is_finished, depth_from, flags, ..self.pending.finish()? }.write(&self.path)?;
+        let (seconds, is_finished, edits) = (self.seconds, self.is_finished, self.edits);
+        Checkpoint { seconds, is_finished, edits, depth_from, flags, ..self.pending.finish()? }.write(&self.path)?;
         if let Some((stored, keyframes)) = &self.keyframes {
             stored.keep_only(keyframes)?;
         }

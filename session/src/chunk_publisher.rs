@@ -1,9 +1,10 @@
 //! Publishes the chunks of models that clients draw themselves, without delaying training.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
-use trainer::{Error, Method, ModelChunks, ModelKind};
+use trainer::{Edits, Error, Method, ModelChunks, ModelKind};
 use viz::Hub;
 
 /// Minimum time between two versions of a model, because each one is read from the GPU and encoded as a whole.
@@ -30,9 +31,9 @@ struct Encoding {
 }
 
 /// The last published version of a model.
-#[derive(Clone, Copy)]
 struct Published {
     step: u64,
+    edits: Arc<Edits>,
     next_at: Instant,
 }
 
@@ -45,7 +46,7 @@ impl ChunkPublisher {
     /// Publishes chunks that are encoded, and starts to encode the model if a client draws it and it has changed.
     /// Returns the time spent, during which the model could not train. A failure does not affect the run: a lost device is
     /// detected by training, too.
-    pub(crate) fn publish(&mut self, kind: ModelKind, method: &mut dyn Method) -> Duration {
+    pub(crate) fn publish(&mut self, kind: ModelKind, method: &mut dyn Method, edits: &Arc<Edits>) -> Duration {
         let began = Instant::now();
         self.finish();
         let name = kind.name();
@@ -56,15 +57,19 @@ impl ChunkPublisher {
         let only_changed = self.hub.has_model_chunks(name) && !self.failed.contains(name);
         let step = method.progress().step;
         let is_due = match self.models.get(name) {
-            Some(published) if only_changed => published.step != step && began >= published.next_at,
+            Some(published) if only_changed => {
+                let has_changed = published.step != step || !Arc::ptr_eq(&published.edits, edits);
+                has_changed && began >= published.next_at
+            }
             Some(published) => began >= published.next_at,
             None => true,
         };
         if self.task.is_some() || !is_due {
             return began.elapsed();
         }
-        self.models.insert(name, Published { step, next_at: began + period.max(MIN_PERIOD) });
-        match method.queue_chunks(only_changed) {
+        let next_at = began + period.max(MIN_PERIOD);
+        self.models.insert(name, Published { step, edits: Arc::clone(edits), next_at });
+        match method.queue_chunks(only_changed, edits) {
             Ok(None) => {}
             Ok(Some(pending)) => {
                 self.task = Some(Encoding { name, began, thread: std::thread::spawn(|| pending.finish()) });

@@ -306,6 +306,7 @@ fn request(keyframe: &Keyframe, lens: &CalibratedCamera) -> RenderRequest {
         near_m: NEAR_M,
         far_m: FAR_M,
         crop: None,
+        edits: Arc::default(),
         background_srgb: [0.0; 3],
         appearance_of: Some((keyframe.camera.clone(), keyframe.stamp)),
         depth: false,

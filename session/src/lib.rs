@@ -31,6 +31,7 @@ mod data;
 mod dataset_export;
 mod decisions;
 pub mod depth_from;
+mod editing;
 mod error;
 pub mod evaluate;
 pub mod evaluation_schedule;

@@ -81,6 +81,8 @@ pub struct Live {
     is_paused: bool,
     /// Result of the last checkpoint that an operator requested.
     checkpoint_note: Option<String>,
+    /// What the last edit did.
+    edit_note: Option<String>,
     chunk_publisher: ChunkPublisher,
     observation_publisher: ObservationPublisher,
 }
@@ -115,6 +117,7 @@ impl Live {
             keyframe_change: None,
             is_paused: false,
             checkpoint_note: None,
+            edit_note: None,
         }
     }
 
@@ -216,6 +219,7 @@ impl Live {
     pub fn advance(&mut self) -> crate::Result<()> {
         self.apply_controls();
         self.record_shown_pictures();
+        self.apply_edits();
         let advanced = self
             .take_keyframes()
             .and_then(|()| self.step())
@@ -269,6 +273,31 @@ impl Live {
                 self.ledger.shown(&picture);
             }
         }
+    }
+
+    /// Applies the edits that operators have requested.
+    fn apply_edits(&mut self) {
+        for request in self.hub.take_edits() {
+            let Some(session_ix) = session_for_method(&self.sessions, request.method()) else {
+                let reason = self.unknown_method(request.method());
+                self.hub.reject_edit(&request, &reason);
+                continue;
+            };
+            match self.sessions[session_ix].edit(request.action()) {
+                Ok(note) => {
+                    self.edit_note = Some(note);
+                    self.published = None; // Viewers wait for the new status.
+                }
+                Err(error) => self.hub.reject_edit(&request, &error.to_string()),
+            }
+        }
+    }
+
+    /// Why there is no model of this method.
+    fn unknown_method(&self, method: Option<&str>) -> String {
+        let available_methods =
+            self.sessions.iter().map(|session| session.kind().name()).collect::<Vec<_>>().join(" or ");
+        format!("no model with the method {:?}; use {available_methods}", method.unwrap_or_default())
     }
 
     /// Pushes new keyframes to the models: all waiting keyframes in real time, or the keyframe that is due in lockstep.
@@ -447,19 +476,18 @@ impl Live {
     /// Starts to draw the next requested picture. Requests that cannot be drawn are answered.
     fn queue_picture(&mut self) -> Option<QueuedRender> {
         loop {
-            let pending = self.hub.next_request()?;
+            let mut pending = self.hub.next_request()?;
             if self.keyframes.is_empty() {
                 pending.fail("no keyframe yet");
                 continue;
             }
             let Some(session_ix) = session_for_method(&self.sessions, pending.method()) else {
-                let available_methods =
-                    self.sessions.iter().map(|session| session.kind().name()).collect::<Vec<_>>().join(" or ");
-                let requested = pending.method().unwrap_or_default().to_owned();
-                pending.fail(&format!("no model with the method {requested:?}; use {available_methods}"));
+                let reason = self.unknown_method(pending.method());
+                pending.fail(&reason);
                 continue;
             };
             let session = &mut self.sessions[session_ix];
+            pending.request.edits = Arc::clone(session.edits());
             let queued = session.queue_picture(&pending.request, pending.packing());
             let trained_on = self.ledger.trained_keyframes(session_ix, session.progress().step);
             return Some(QueuedRender { pending: pending.of_keyframes(trained_on), session_ix, queued });
@@ -540,7 +568,7 @@ impl Live {
                 self.notes.clone(),
                 self.device_notes.list(),
                 movements.iter().map(ToString::to_string).collect(),
-                self.checkpoint_note.iter().cloned().collect(),
+                [&self.checkpoint_note, &self.edit_note].into_iter().flatten().cloned().collect(),
             ]
             .concat(),
             ..Status::default()
@@ -678,6 +706,7 @@ fn model_status(session: &Session) -> ModelStatus {
         primitives_label: session.kind().entry().primitives_label.to_owned(),
         bytes: progress.bytes,
         has_chunks: session.kind().entry().has_chunks,
+        edits: session.edits().len(),
         psnr: session.psnr(),
         psnr_history: session.psnr_history().to_vec(),
     }

@@ -11,7 +11,7 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
-use trainer::{Method, ModelKind};
+use trainer::{Edits, Method, ModelKind};
 
 /// File extension of recordings.
 const RECORDING_EXTENSION: &str = "mcap";
@@ -271,18 +271,23 @@ fn lock(folder: &Path) -> crate::Result<()> {
     Ok(())
 }
 
-/// Saves a model in a temporary subfolder and moves its files into place once it is complete.
-pub fn save_model(method: &mut dyn Method, folder: &Path) -> crate::Result<()> {
+/// Saves a model and its edits in a temporary subfolder and moves its files into place once it is complete.
+pub fn save_model(method: &mut dyn Method, edits: &Edits, folder: &Path) -> crate::Result<()> {
     let partial_folder = folder.join(PARTIAL_MODEL);
     if partial_folder.exists() {
         // An earlier run was killed while saving.
         std::fs::remove_dir_all(&partial_folder)
             .with_context(|| format!("cannot remove {}", partial_folder.display()))?;
     }
-    if let Err(error) = method.save(&partial_folder) {
+    let save_edited = |method: &mut dyn Method| match edits.is_empty() {
+        true => Ok(()),
+        false => method.write_for_others(&partial_folder, edits),
+    };
+    if let Err(error) = method.save(&partial_folder).and_then(|()| save_edited(method)) {
         let _ = std::fs::remove_dir_all(&partial_folder); // Frees the disk space of the incomplete model.
         return Err(error.into());
     }
+    edits.write(folder)?;
     // A model counts as complete once the last file of its method is in place.
     for name in ModelKind::model_files().filter(|name| partial_folder.join(name).exists()) {
         let path = folder.join(name);

@@ -18,10 +18,10 @@ use crate::chunk_publisher::ChunkPublisher;
 use crate::clock::Clock;
 use crate::decisions::DecisionLog;
 use crate::evaluate::Evaluator;
-use crate::gpu_loss;
 use crate::next_commands::DataSource;
 use crate::observer::{Evaluation, Observer};
 use crate::recovery::Recovery;
+use crate::{editing, gpu_loss};
 use calibration::{Alignment, CalibratedCamera, CameraCorrection};
 use capture::Stop;
 use keyframe::Keyframe;
@@ -33,8 +33,11 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use trainer::gpu::Gpu;
-use trainer::{FailedModel, Method, ModelKind, Packing, Picture, Progress, QueuedPicture, RenderRequest, Rendered};
+use trainer::{
+    Edits, FailedModel, Method, ModelKind, Packing, Picture, Progress, QueuedPicture, RenderRequest, Rendered,
+};
 use training_time::TrainingTime;
+use viz::EditAction;
 
 /// Approximate duration of a slice. The device is idle for a moment at the end of each slice.
 const TIME_SLICE: Duration = Duration::from_millis(40);
@@ -55,6 +58,8 @@ pub struct Session {
     reporter: Reporter,
     /// A stop request aborts an evaluation in progress.
     stop: Stop,
+    /// Erased space, which is not drawn for viewers. Training and scores ignore it.
+    edits: Arc<Edits>,
 }
 
 impl Session {
@@ -76,6 +81,7 @@ impl Session {
             persistence: Persistence::default(),
             reporter: Reporter::new(kind, observer),
             stop: Stop::default(),
+            edits: Arc::default(),
         }
     }
 
@@ -102,6 +108,11 @@ impl Session {
     pub fn with_profile(mut self, profiles: bool) -> Self {
         self.reporter.set_profiles(profiles);
         self
+    }
+
+    /// Continues with the edits of an earlier run.
+    pub fn with_edits(self, edits: Edits) -> Self {
+        Self { edits: Arc::new(edits), ..self }
     }
 
     /// Enables the log of timing-dependent decisions.
@@ -225,7 +236,17 @@ impl Session {
 
     /// Publishes the chunks of the model if they are due. Returns the time spent.
     pub(crate) fn publish_chunks(&mut self, publisher: &mut ChunkPublisher) -> Duration {
-        publisher.publish(self.kind(), self.method.as_mut())
+        publisher.publish(self.kind(), self.method.as_mut(), &self.edits)
+    }
+
+    /// Erased space, for pictures that viewers request.
+    pub fn edits(&self) -> &Arc<Edits> {
+        &self.edits
+    }
+
+    /// Changes the edits. Returns a note on what was done.
+    pub(crate) fn edit(&mut self, action: &EditAction) -> Result<String, trainer::Error> {
+        editing::apply(action, &mut self.edits, self.method.as_mut())
     }
 
     /// Waits for queued work and returns the total number of updates, including those of trials.
@@ -440,8 +461,8 @@ impl Session {
     /// Writes a checkpoint, or the new keyframes, if they are due.
     pub(crate) fn write_checkpoint_when_due(&mut self) -> crate::Result<()> {
         let seconds = self.secs();
-        let (method, keyframes) = (self.method.as_mut(), &self.keyframes[..]);
-        self.persistence.write_checkpoint_when_due(Snapshot { method, keyframes, seconds, is_finished: false })
+        let (method, keyframes, edits) = (self.method.as_mut(), &self.keyframes[..], &*self.edits);
+        self.persistence.write_checkpoint_when_due(Snapshot { method, keyframes, edits, seconds, is_finished: false })
     }
 
     /// Writes a checkpoint if one is due, and evaluates if an evaluation is due. A finished session does neither.

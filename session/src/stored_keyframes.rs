@@ -155,6 +155,7 @@ fn to_checkpoint(keyframe: &Keyframe) -> crate::Result<Checkpoint> {
         depth_from: None,
         flags: BTreeMap::new(),
         is_finished: false,
+        edits: trainer::Edits::default(),
         state: serde_json::to_value(description)?,
         arrays,
     })

@@ -1,12 +1,15 @@
 //! Draws trained models for viewers: the loop of `view`, and of a run after its training.
 
 use crate::chunk_publisher::ChunkPublisher;
+use crate::editing;
 use crate::observations::{ObservationPublisher, SeenFrom};
 use capture::Stop;
 use kinematics::Transform;
+use std::path::PathBuf;
+use std::sync::Arc;
 use std::time::Duration;
-use trainer::{Aabb, Method, ModelKind, RenderRequest, Rendered};
-use viz::{Hub, KeyframePose, PendingRender};
+use trainer::{Aabb, Edits, Method, ModelKind, RenderRequest, Rendered};
+use viz::{Control, EditAction, EditRequest, Hub, KeyframePose, ModelStatus, PendingRender, Status};
 
 /// Maximum response time to Ctrl-C while no client requests a picture.
 const POLL_PERIOD: Duration = Duration::from_millis(100);
@@ -17,6 +20,10 @@ pub struct ServedModel {
     pub kind: ModelKind,
     /// The model.
     pub method: Box<dyn Method>,
+    /// Erased space, in the model's world.
+    pub edits: Arc<Edits>,
+    /// Folder or file of the saved model. Only folders can hold edits.
+    pub path: PathBuf,
 }
 
 /// Trained models and the hub of the clients that view them.
@@ -30,6 +37,8 @@ pub struct ModelViewer {
     observation_publisher: ObservationPublisher,
     /// Pose of the page's world, which is z up, in the model's world.
     model_from_page: Transform,
+    /// What the last edit or save did.
+    note: Option<String>,
 }
 
 impl ModelViewer {
@@ -43,6 +52,7 @@ impl ModelViewer {
             observation_publisher: ObservationPublisher::new(hub.clone()),
             hub,
             model_from_page: Transform::identity(),
+            note: None,
         }
     }
 
@@ -55,6 +65,7 @@ impl ModelViewer {
     /// Draws requested pictures until a signal requests a stop.
     pub fn serve(&mut self, stop: &Stop) {
         while !stop.signaled() {
+            self.apply_edits();
             if self.hub.wait_for_request(POLL_PERIOD)
                 && let Some(pending) = self.hub.next_request()
             {
@@ -77,21 +88,66 @@ impl ModelViewer {
     }
 
     fn publish_chunks(&mut self) {
-        for ServedModel { kind, method } in &mut self.models {
-            self.chunk_publisher.publish(*kind, method.as_mut());
+        for ServedModel { kind, method, edits, .. } in &mut self.models {
+            self.chunk_publisher.publish(*kind, method.as_mut(), edits);
         }
+    }
+
+    /// Applies the edits that operators have requested, and saves them if this is requested.
+    fn apply_edits(&mut self) {
+        for request in self.hub.take_edits() {
+            match self.edit(&request) {
+                Ok(note) => self.publish_edits(note),
+                Err(reason) => self.hub.reject_edit(&request, &reason),
+            }
+        }
+        if self.hub.take_controls().contains(&Control::Save) {
+            let notes = self.models.iter_mut().map(ServedModel::save_edits).collect::<Vec<_>>();
+            self.publish_edits(notes.join("; "));
+        }
+    }
+
+    /// Makes an edit. Returns a note on what was done, or the reason why it was not possible.
+    fn edit(&mut self, request: &EditRequest) -> Result<String, String> {
+        let model_from_page = self.model_from_page;
+        let model = self.model_mut(request.method())?;
+        let action = match *request.action() {
+            EditAction::Erase(aabb) => EditAction::Erase(box_in_model(aabb, &model_from_page)),
+            action => action,
+        };
+        editing::apply(&action, &mut model.edits, model.method.as_mut()).map_err(|error| error.to_string())
+    }
+
+    /// Publishes the numbers of edits and a note.
+    fn publish_edits(&mut self, note: String) {
+        let previous = self.note.replace(note.clone());
+        self.hub.change_status(|Status { model, others, notes, .. }| {
+            for ModelStatus { method, edits, .. } in std::iter::once(model).chain(others) {
+                let model = self.models.iter().find(|model| model.kind.name() == method);
+                *edits = model.map_or(0, |model| model.edits.len());
+            }
+            notes.retain(|shown| Some(shown) != previous.as_ref());
+            notes.push(note);
+        });
+    }
+
+    /// The model of this method; the first one if no method is given.
+    fn model_mut(&mut self, method: Option<&str>) -> Result<&mut ServedModel, String> {
+        let names = self.models.iter().map(|model| model.kind.name()).collect::<Vec<_>>().join(" or ");
+        let is_requested = |model: &&mut ServedModel| method.is_none_or(|name| model.kind.name() == name);
+        self.models
+            .iter_mut()
+            .find(is_requested)
+            .ok_or_else(|| format!("no model with the method {:?}; use {names}", method.unwrap_or_default()))
     }
 
     fn answer(&mut self, pending: PendingRender) {
         let request = in_model(&pending.request, &self.model_from_page);
-        let requested_method = pending.method().map(str::to_owned);
-        let is_requested =
-            |model: &&mut ServedModel| requested_method.as_deref().is_none_or(|name| model.kind.name() == name);
-        let Some(model) = self.models.iter_mut().find(is_requested) else {
-            let names: Vec<&str> = self.models.iter().map(|model| model.kind.name()).collect();
-            let requested_method = requested_method.unwrap_or_default();
-            return pending.fail(&format!("no model with the method {requested_method:?}; use {}", names.join(" or ")));
+        let model = match self.model_mut(pending.method()) {
+            Ok(model) => model,
+            Err(reason) => return pending.fail(&reason),
         };
+        let request = RenderRequest { edits: Arc::clone(&model.edits), ..request };
         let rendered = match pending.packing() {
             Some(packing) => model.method.render_packed(&request, packing),
             None => model.method.render(&request).map(Rendered::Picture),
@@ -103,8 +159,28 @@ impl ModelViewer {
     }
 }
 
+impl ServedModel {
+    /// Writes the edits into the folder of the model. Returns a note on the result.
+    fn save_edits(&mut self) -> String {
+        let path = self.path.display();
+        if !self.path.is_dir() {
+            return format!("edits cannot be saved: {path} is not a model folder");
+        }
+        let saved = self.edits.write(&self.path).and_then(|()| self.method.write_for_others(&self.path, &self.edits));
+        match saved {
+            Ok(()) => format!("edits saved in {path}"),
+            Err(error) => format!("cannot save the edits: {:#}", crate::Error::from(error)),
+        }
+    }
+}
+
+/// Transforms a box from the page's world frame to the model's world frame.
+fn box_in_model(aabb: Aabb, model_from_page: &Transform) -> Aabb {
+    Aabb { world_from_box: model_from_page * aabb.world_from_box, ..aabb }
+}
+
 /// Transforms a request from the page's world frame to the model's world frame.
 fn in_model(request: &RenderRequest, model_from_page: &Transform) -> RenderRequest {
-    let crop = request.crop.map(|crop| Aabb { world_from_box: model_from_page * crop.world_from_box, ..crop });
+    let crop = request.crop.map(|crop| box_in_model(crop, model_from_page));
     RenderRequest { world_from_camera: model_from_page * request.world_from_camera, crop, ..request.clone() }
 }

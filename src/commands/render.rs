@@ -12,8 +12,9 @@ use session::methods;
 use session::partial::Partial;
 use session::run_folder::expect_model;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::time::Instant;
-use trainer::{Aabb, Picture, Projection, RenderRequest};
+use trainer::{Aabb, LoadedModel, Picture, Projection, RenderRequest};
 
 /// Image size if neither a flag nor the camera path gives one.
 const DEFAULT_SIZE_PX: [u32; 2] = [1280, 720];
@@ -110,13 +111,14 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     expect_model(&args.model)?;
     check_no_overwrite(&args.out, requests.len())?;
     signals::remove_partial_files_on_signals()?;
-    let mut model = methods::load(open_gpu()?, &args.model)?.method;
+    let LoadedModel { method: mut model, edits, .. } = methods::load(open_gpu()?, &args.model)?;
+    let edits = Arc::new(edits);
     std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create the folder {}", args.out.display()))?;
     let bar = print::bar(Some(requests.len() as u64), "{bar:30} {pos} of {len}", args.json);
     let mut covered_fracs = Vec::new();
     for (ix, request) in requests.iter().enumerate() {
         let since = Instant::now();
-        let picture = model.render(request)?;
+        let picture = model.render(&RenderRequest { edits: Arc::clone(&edits), ..request.clone() })?;
         let draw_millis = since.elapsed().as_secs_f64() * 1e3;
         covered_fracs.push(covered_frac(&picture));
         let (picture, depth) = write(&args.out, ix, &picture, args.depth)?;
@@ -160,6 +162,7 @@ impl Args {
                 min_m: [x, y, z],
                 max_m: [to_x, to_y, to_z],
             }),
+            edits: Arc::default(),
             background_srgb: [0.0; 3],
             appearance_of: None,
             depth: self.depth,

@@ -38,7 +38,7 @@ use std::time::Duration;
 use trainer::checkpoint::Checkpoint;
 use trainer::gpu::Gpu;
 use trainer::splat::CountPolicy;
-use trainer::{CommonOptions, ModelKind, ModelSpec, Resumed};
+use trainer::{CommonOptions, Edits, ModelKind, ModelSpec, Resumed};
 use viz::{Hub, RunResult};
 
 /// Flags of `run`.
@@ -201,7 +201,8 @@ fn drive(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
     let (exit, models) = save(live, args, &rig, folders, &damage)?;
     if args.keeps_serving() && !models.is_empty() && !stop.signaled() {
         print::report(format_args!("serving the page at {} until Ctrl-C", page.url()));
-        let shown = |FinishedModel { kind, method, .. }| ServedModel { kind, method };
+        let shown =
+            |FinishedModel { kind, method, edits, folder, .. }| ServedModel { kind, method, edits, path: folder };
         ModelViewer::new(models.into_iter().map(shown).collect(), hub).serve(&stop);
     }
     Ok(exit)
@@ -329,7 +330,7 @@ pub(super) fn start(
         None => {
             let start = |model_spec: ModelSpec| {
                 let method = model_spec.start(gpu.clone())?;
-                Ok(Resumed { model_spec, method, untrained: Vec::new() })
+                Ok(Resumed { model_spec, method, untrained: Vec::new(), edits: Edits::default() })
             };
             let model_specs = methods::specs(&kinds, &common, &settings)?;
             model_specs.into_iter().map(start).collect::<session::Result<_>>()?
@@ -364,7 +365,7 @@ pub(super) fn start(
     let limits = Limits { seconds: args.seconds, steps: args.steps };
     let clock = Clock::default();
     let mut sessions = Vec::new();
-    for (Resumed { model_spec: ModelSpec { kind, options }, mut method, untrained }, folder) in
+    for (Resumed { model_spec: ModelSpec { kind, options }, mut method, untrained, edits }, folder) in
         models.into_iter().zip(&folders)
     {
         let from_step = previous.is_some().then(|| method.n_total_steps()).transpose()?;
@@ -396,6 +397,7 @@ pub(super) fn start(
         let run_flags = RunFlags { depth_from: None, flags: args.flags(limits) };
         let session = Session::new(gpu.clone(), (kind, method), evaluators.clone(), limits, Box::new(console))
             .with_stop(&stop)
+            .with_edits(edits)
             .with_stepwise_scoring()
             .with_checkpoints(checkpoints.map(|to| to.with_flags(run_flags).with_keyframes(folder)))
             .with_decisions(decisions)

@@ -24,7 +24,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 use trainer::checkpoint::Checkpoint;
 use trainer::gpu::Gpu;
-use trainer::{ModelKind, ModelSpec, Resumed};
+use trainer::{Edits, ModelKind, ModelSpec, Resumed};
 
 /// Training time if no flag limits it.
 const DEFAULT_SECONDS: f64 = 120.0;
@@ -218,7 +218,9 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
     let is_untrained = |keyframe: &Arc<Keyframe>| untrained.iter().any(|other| Arc::ptr_eq(other, keyframe));
     let clock = Clock::default();
     let (mut sessions, mut seeds) = (Vec::new(), Vec::new());
-    for (Resumed { model_spec: ModelSpec { kind, options }, method, .. }, folder) in models.into_iter().zip(&folders) {
+    for (Resumed { model_spec: ModelSpec { kind, options }, method, edits, .. }, folder) in
+        models.into_iter().zip(&folders)
+    {
         run_folder::write_keyframe_list(&folder.join("keyframes.txt"), &data.keyframes)?;
         seeds.push(options.common.seed);
         let description = RunDescription {
@@ -246,6 +248,7 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
         let checkpoints = Checkpoints::new(folder, args.checkpoints.options());
         let session = Session::new(gpu.clone(), (kind, method), evaluators.clone(), limits, Box::new(console))
             .with_stop(&stop)
+            .with_edits(edits)
             .with_checkpoints(checkpoints.map(|to| to.with_flags(run_flags.clone())))
             .with_profile(args.profile)
             .with_decisions(decisions)
@@ -336,7 +339,7 @@ impl Args {
         };
         let start = |model_spec: ModelSpec| {
             let method = model_spec.start(gpu.clone())?;
-            Ok(Resumed { model_spec, method, untrained: data.keyframes.clone() })
+            Ok(Resumed { model_spec, method, untrained: data.keyframes.clone(), edits: Edits::default() })
         };
         model_specs.into_iter().map(start).collect()
     }

@@ -69,8 +69,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let models = paths.iter().map(|path| methods::load(gpu.clone(), path));
     let mut models = models.collect::<session::Result<Vec<LoadedModel>>>()?;
     let bounds = if cameras.is_empty() { bounds(&mut models)? } else { None };
-    let mut statuses =
-        paths.iter().zip(&models).map(|(path, model)| model_status(path, model.kind, &model.method.progress()));
+    let mut statuses = paths.iter().zip(&models).map(|(path, model)| model_status(path, model));
     let report = report(&paths[0]);
     let status = Status {
         state: "viewing".to_owned(),
@@ -90,7 +89,8 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
 
     let methods: Vec<&str> = models.iter().map(|model| model.kind.name()).collect();
     page.print(args.json, json!({ "methods": methods }))?;
-    let models = models.into_iter().map(|LoadedModel { kind, method }| ServedModel { kind, method }).collect();
+    let served = |(LoadedModel { kind, method, edits }, path)| ServedModel { kind, method, edits: edits.into(), path };
+    let models = models.into_iter().zip(paths).map(served).collect();
     ModelViewer::new(models, hub).with_model_from_page(model_from_page).serve(&stop);
     Ok(Exit::Done)
 }
@@ -164,7 +164,11 @@ fn report(model: &Path) -> Value {
 }
 
 /// Size and scores of a model at the end of its training.
-fn model_status(model: &Path, kind: ModelKind, progress: &Progress) -> ModelStatus {
+fn model_status(path: &Path, model: &LoadedModel) -> ModelStatus {
+    ModelStatus { edits: model.edits.len(), ..trained_status(path, model.kind, &model.method.progress()) }
+}
+
+fn trained_status(model: &Path, kind: ModelKind, progress: &Progress) -> ModelStatus {
     let report = report(model);
     let (done, evaluations) = (&report["done"], report["evaluations"].as_array());
     let point = |evaluation: &Value| Some((evaluation["seconds"].as_f64()?, evaluation["psnr"].as_f64()?));
@@ -176,6 +180,7 @@ fn model_status(model: &Path, kind: ModelKind, progress: &Progress) -> ModelStat
         primitives_label: kind.entry().primitives_label.to_owned(),
         bytes: progress.bytes,
         has_chunks: kind.entry().has_chunks,
+        edits: 0,
         psnr: done["psnr"].as_f64(),
         psnr_history: evaluations.into_iter().flatten().chain([done]).filter_map(point).collect(),
     }
@@ -210,14 +215,14 @@ mod tests {
     fn model_status_uses_the_report_scores() {
         let folder = tempfile::tempdir().expect("a folder");
         let progress = Progress { primitives: 5, bytes: 80, ..Progress::default() };
-        let status = model_status(folder.path(), ModelKind::default(), &progress);
+        let status = trained_status(folder.path(), ModelKind::default(), &progress);
         assert_eq!((status.psnr, status.step, status.primitives, status.bytes), (None, 0, 5, 80));
         let text = json!({
             "done": { "psnr": 23.5, "steps": 700, "seconds": 8.0 },
             "evaluations": [{ "seconds": 0.5, "psnr": 20.0 }, { "seconds": 1.0, "psnr": null }, { "seconds": 2.0, "psnr": 22.0 }],
         });
         std::fs::write(folder.path().join("report.json"), text.to_string()).expect("the file is writable");
-        let status = model_status(folder.path(), ModelKind::default(), &progress);
+        let status = trained_status(folder.path(), ModelKind::default(), &progress);
         assert_eq!((status.psnr, status.step), (Some(23.5), 700));
         assert_eq!(status.psnr_history, [(0.5, 20.0), (2.0, 22.0), (8.0, 23.5)]);
     }

@@ -90,6 +90,7 @@ fn request() -> RenderRequest {
         near_m: 0.01,
         far_m: 100.0,
         crop: None,
+        edits: Arc::default(),
         background_srgb: [0.0, 0.5, 1.0],
         appearance_of: None,
         depth: true,

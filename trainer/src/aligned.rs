@@ -7,6 +7,7 @@
 //! keyframes; the model moves along with them or restarts, see [`Recalibrate`].
 
 use crate::checkpoint::{Checkpoint, PendingCheckpoint};
+use crate::edits::{Edits, Floaters};
 use crate::gpu::{Gpu, PassTiming};
 use crate::model_chunks::PendingChunks;
 use crate::model_metadata::{METADATA_FILE, read_metadata};
@@ -448,8 +449,16 @@ impl<M: Recalibrate + 'static> Method for Aligned<M> {
         self.model.queue_packed(request, packing)
     }
 
-    fn queue_chunks(&mut self, only_changed: bool) -> Result<Option<PendingChunks>, Error> {
-        self.model.queue_chunks(only_changed)
+    fn queue_chunks(&mut self, only_changed: bool, edits: &Arc<Edits>) -> Result<Option<PendingChunks>, Error> {
+        self.model.queue_chunks(only_changed, edits)
+    }
+
+    fn find_floaters(&mut self, edits: &Edits) -> Result<Floaters, Error> {
+        self.model.find_floaters(edits)
+    }
+
+    fn write_for_others(&mut self, folder: &Path, edits: &Edits) -> Result<(), Error> {
+        self.model.write_for_others(folder, edits)
     }
 
     fn set_watched(&mut self, watched: bool) {

@@ -2,6 +2,7 @@
 //!
 //! `docs/reference/files.md` describes the layout.
 
+use crate::edits::Edits;
 use crate::pending::Pending;
 use crate::{Error, atomic_file};
 use serde::{Deserialize, Serialize};
@@ -30,6 +31,8 @@ pub struct Checkpoint {
     pub flags: BTreeMap<String, String>,
     /// Whether training had reached its limit.
     pub is_finished: bool,
+    /// Erased space.
+    pub edits: Edits,
     /// The method's state without its arrays.
     pub state: serde_json::Value,
     /// Large arrays, little endian.
@@ -60,6 +63,8 @@ struct Header {
     flags: BTreeMap<String, String>,
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     is_finished: bool,
+    #[serde(default, skip_serializing_if = "Edits::is_empty")]
+    edits: Edits,
     state: serde_json::Value,
     arrays: Vec<ArrayHeader>,
 }
@@ -79,6 +84,7 @@ impl Checkpoint {
             depth_from: None,
             flags: BTreeMap::new(),
             is_finished: false,
+            edits: Edits::default(),
             state,
             arrays,
         }
@@ -118,6 +124,7 @@ impl Checkpoint {
             depth_from: self.depth_from.clone(),
             flags: self.flags.clone(),
             is_finished: self.is_finished,
+            edits: self.edits.clone(),
             state: self.state.clone(),
             arrays: lengths.collect(),
         })?;
@@ -166,14 +173,23 @@ impl Checkpoint {
             arrays.push(Array { name, bytes: array.to_vec() });
             rest = after;
         }
-        let Header { method, seconds, depth_from, flags, is_finished, state, .. } = header;
-        Ok(Self { method, seconds, depth_from, flags, is_finished, state, arrays })
+        let Header { method, seconds, depth_from, flags, is_finished, edits, state, .. } = header;
+        Ok(Self { method, seconds, depth_from, flags, is_finished, edits, state, arrays })
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::Aabb;
+    use crate::edits::Edit;
+
+    fn edits() -> Edits {
+        let mut edits = Edits::default();
+        let world_from_box = kinematics::Transform::translation(0.1, -2.0, 0.3);
+        edits.push(Edit::Box(Aabb { world_from_box, min_m: [-0.1; 3], max_m: [0.7; 3] })).unwrap();
+        edits
+    }
 
     fn checkpoint() -> Checkpoint {
         let arrays = [("means", vec![1, 2, 3]), ("nothing", vec![]), ("more", vec![9; 100])];
@@ -183,6 +199,7 @@ mod tests {
             depth_from: Some("5ad1".into()),
             flags: BTreeMap::from([("scale".into(), "0.5".into())]),
             is_finished: true,
+            edits: edits(),
             state: serde_json::json!({ "step": u64::MAX, "size_m": 1.0 / 3.0 }),
             arrays: arrays.map(|(name, bytes)| Array { name: name.into(), bytes }).into(),
         }

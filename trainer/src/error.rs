@@ -234,6 +234,18 @@ pub enum Error {
         /// Width of a cell, meters.
         cell_m: f64,
     },
+    /// A model has the maximum number of edits.
+    #[error("a model has at most {} edits; undo one first", crate::edits::MAX_EDITS)]
+    TooManyEdits,
+    /// A model has no edit that could be undone.
+    #[error("there is nothing to undo")]
+    NothingToUndo,
+    /// No part of a model is small and unconnected.
+    #[error("no floaters found: every part of the model is connected to a large part")]
+    NoFloaters,
+    /// The method cannot find floaters.
+    #[error("floaters can be removed only from splats and distance fields; erase a box instead")]
+    CannotFindFloaters,
     /// Arrays of splats are inconsistent.
     #[error("splats: {0}")]
     SplatArrays(String),

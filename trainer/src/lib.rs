@@ -9,9 +9,11 @@
 //! # Ok::<(), trainer::Error>(())
 //! ```
 
+mod aabb;
 mod aligned;
 mod bounds;
 pub mod checkpoint;
+pub mod edits;
 mod error;
 pub mod eval;
 mod failed_model;
@@ -50,8 +52,10 @@ pub mod atomic_file;
 pub mod tsdf;
 mod view;
 
+pub use aabb::Aabb;
 pub use aligned::{Aligned, CorrectedKeyframe, Recalibrate, ResumedModel};
 pub use bounds::Bounds;
+pub use edits::Edits;
 pub use error::Error;
 pub use failed_model::FailedModel;
 pub use method::{Method, Progress};
@@ -61,4 +65,4 @@ pub use model_spec::{LoadedModel, ModelSpec, Resumed, load, resume};
 pub use packing::{JPEG_QUALITY, PackedDepth, PackedPicture, Packing, QueuedPicture, Rendered};
 pub use pending::Pending;
 pub use registry::ModelKind;
-pub use request::{Aabb, Picture, Projection, RenderRequest};
+pub use request::{Picture, Projection, RenderRequest};

@@ -2,6 +2,7 @@
 
 use crate::bounds::Bounds;
 use crate::checkpoint::PendingCheckpoint;
+use crate::edits::{Edits, Floaters};
 use crate::gpu::PassTiming;
 use crate::model_chunks::PendingChunks;
 use crate::{Error, Packing, Picture, QueuedPicture, RenderRequest, Rendered};
@@ -74,12 +75,21 @@ pub trait Method {
         self.render_packed(request, packing).map(QueuedPicture::ready)
     }
     /// Starts to encode the model for clients that draw it themselves. With `only_changed`, only the chunks that have
-    /// changed since the last call are encoded. Later training does not affect the result. Waiting for the GPU and
-    /// encoding take place in [`PendingChunks::finish`].
+    /// changed since the last call are encoded. Erased space is left out. Later training does not affect the result.
+    /// Waiting for the GPU and encoding take place in [`PendingChunks::finish`].
     ///
     /// `None` if the model is empty or if [`MethodEntry::has_chunks`](crate::method_entry::MethodEntry) is false.
-    fn queue_chunks(&mut self, _only_changed: bool) -> Result<Option<PendingChunks>, Error> {
+    fn queue_chunks(&mut self, _only_changed: bool, _edits: &Arc<Edits>) -> Result<Option<PendingChunks>, Error> {
         Ok(None)
+    }
+    /// Finds small parts that are not connected to the large parts of the model. Space that is already erased is
+    /// ignored. Waits for queued work and does not change the model.
+    ///
+    /// # Errors
+    ///
+    /// Fails if there are none, or if the model does not support this.
+    fn find_floaters(&mut self, _edits: &Edits) -> Result<Floaters, Error> {
+        Err(Error::CannotFindFloaters)
     }
     /// PSNR of the requested picture against a keyframe's image of the same size, dB, computed on the GPU.
     /// Bit-identical to [`crate::eval::psnr`] of the 8-bit picture. `None` if the model does not support this, or not
@@ -136,6 +146,11 @@ pub trait Method {
     fn report(&self) -> Vec<TrialReport>;
     /// Writes the model into an existing folder. The files do not depend on the number of planned steps.
     fn save(&mut self, folder: &Path) -> Result<(), Error>;
+    /// Writes the files of a saved model that are only for other programs, without erased space. All other files contain
+    /// the complete model.
+    fn write_for_others(&mut self, _folder: &Path, _edits: &Edits) -> Result<(), Error> {
+        Ok(())
+    }
     /// Takes a checkpoint of everything needed to continue training; later training does not change it.
     fn checkpoint(&mut self) -> Result<PendingCheckpoint, Error>;
 }

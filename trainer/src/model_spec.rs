@@ -4,7 +4,7 @@ use crate::checkpoint::Checkpoint;
 use crate::gpu::Gpu;
 use crate::model_options::{CommonOptions, MethodOptions, ModelOptions};
 use crate::registry::ModelKind;
-use crate::{Error, Method};
+use crate::{Edits, Error, Method};
 use keyframe::Keyframe;
 use serde::Deserialize;
 use serde_json::Value;
@@ -28,6 +28,8 @@ pub struct Resumed {
     pub method: Box<dyn Method>,
     /// Keyframes that the model was not trained on: test keyframes and new ones.
     pub untrained: Vec<Arc<Keyframe>>,
+    /// Erased space.
+    pub edits: Edits,
 }
 
 /// A saved model in GPU memory.
@@ -36,6 +38,8 @@ pub struct LoadedModel {
     pub kind: ModelKind,
     /// The model.
     pub method: Box<dyn Method>,
+    /// Erased space.
+    pub edits: Edits,
 }
 
 impl ModelSpec {
@@ -101,7 +105,7 @@ pub fn resume(gpu: Arc<Gpu>, checkpoint: &Checkpoint, keyframes: &[Arc<Keyframe>
     let options = ModelOptions::deserialize(options)
         .map_err(|error| Error::CheckpointState { reason: format!("options: {error}") })?;
     let (method, untrained) = (kind.entry().resume)(gpu, checkpoint, keyframes)?;
-    Ok(Resumed { model_spec: ModelSpec { kind, options }, method, untrained })
+    Ok(Resumed { model_spec: ModelSpec { kind, options }, method, untrained, edits: checkpoint.edits.clone() })
 }
 
 /// Loads a saved model from its folder, or from a single file.
@@ -111,7 +115,7 @@ pub fn resume(gpu: Arc<Gpu>, checkpoint: &Checkpoint, keyframes: &[Arc<Keyframe>
 /// Fails if the method of the model is unknown, if a file is invalid, or on an error of the GPU.
 pub fn load(gpu: Arc<Gpu>, model: &Path) -> Result<LoadedModel, Error> {
     let kind = ModelKind::of_saved(model)?.ok_or_else(|| Error::UnknownModel { path: model.to_owned() })?;
-    Ok(LoadedModel { kind, method: (kind.entry().load)(gpu, model)? })
+    Ok(LoadedModel { kind, edits: Edits::read(model)?, method: (kind.entry().load)(gpu, model)? })
 }
 
 fn registered(name: &str) -> Result<ModelKind, Error> {

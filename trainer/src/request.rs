@@ -1,20 +1,11 @@
 //! Requests for pictures of a model, and the rendered pictures.
 
+use crate::aabb::Aabb;
+use crate::edits::Edits;
 use crate::gpu::Buffer;
 use keyframe::Shutter;
 use kinematics::{Stamp, Transform};
 use std::sync::Arc;
-
-/// A box aligned with the axes of its frame, meters.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Aabb {
-    /// Pose of the box's frame.
-    pub world_from_box: Transform,
-    /// Corner with the smallest coordinates.
-    pub min_m: [f64; 3],
-    /// Corner with the largest coordinates.
-    pub max_m: [f64; 3],
-}
 
 /// How directions map to pixels.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -48,6 +39,8 @@ pub struct RenderRequest {
     pub far_m: f64,
     /// Only space inside this box is rendered.
     pub crop: Option<Aabb>,
+    /// Erased space, which is not rendered.
+    pub edits: Arc<Edits>,
     /// Background color, sRGB 0 to 1.
     pub background_srgb: [f32; 3],
     /// Camera and stamp of the image whose lighting and exposure to use, if the model has them; `None`: the mean image.

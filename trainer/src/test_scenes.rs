@@ -5,6 +5,7 @@ use crate::tsdf::TsdfOptions;
 use crate::{Projection, RenderRequest};
 pub(crate) use keyframe::scenes::*;
 use kinematics::Transform;
+use std::sync::Arc;
 
 pub(crate) fn options() -> ModelOptions<TsdfOptions> {
     ModelOptions::from(TsdfOptions { voxel_m: Some(0.02), noise_per_m2: Some(1e-4), ..TsdfOptions::default() })
@@ -19,6 +20,7 @@ pub(crate) fn request(world_from_camera: Transform) -> RenderRequest {
         near_m: 0.01,
         far_m: 100.0,
         crop: None,
+        edits: Arc::default(),
         background_srgb: [0.0, 0.5, 1.0],
         appearance_of: None,
         depth: true,

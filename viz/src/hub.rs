@@ -2,6 +2,7 @@
 
 use crate::base_path::BasePath;
 use crate::chunk_list::ChunkList;
+use crate::edit::EditRequest;
 use crate::observation_map::{ObservationMap, PackedObservations};
 use crate::picture::packing;
 use crate::picture_times::{SentPicture, ShownPicture, ShownPictures, TrainedKeyframes};
@@ -46,6 +47,8 @@ type KeyframeSources = BTreeMap<(Arc<str>, i64), Weak<Keyframe>>;
 /// A client gets keyframes and images this long after it has joined, or after its hello. Earlier, it is not known which
 /// of them it wants, and at which size.
 const HELLO_GRACE: Duration = Duration::from_millis(500);
+/// Maximum number of edits that wait to be applied.
+pub(crate) const MAX_WAITING_EDITS: usize = 64;
 /// Maximum time between two positions on the path of the base.
 const PATH_PERIOD: Duration = Duration::from_millis(100);
 
@@ -102,6 +105,8 @@ struct Shared {
     /// Actions that the run has not taken yet, without repetitions.
     controls: Mutex<Vec<Control>>,
     shown_pictures: Mutex<ShownPictures>,
+    /// Edits that the run has not taken yet.
+    edits: Mutex<Vec<EditRequest>>,
     /// Whether somebody besides the clients needs images and robot states.
     is_observed: AtomicBool,
     queue: Mutex<Queue>,
@@ -132,7 +137,8 @@ impl Hub {
         });
     }
 
-    fn change_status(&self, change: impl FnOnce(&mut Status)) {
+    /// Changes the latest status.
+    pub fn change_status(&self, change: impl FnOnce(&mut Status)) {
         self.shared.status.send_modify(|latest| {
             let mut status = latest.as_deref().cloned().unwrap_or_default();
             change(&mut status);
@@ -313,6 +319,27 @@ impl Hub {
         if let Some(picture) = picture {
             self.shared.shown_pictures.lock().push(picture);
         }
+    }
+
+    /// The edits that operators have requested since the last call, in order.
+    pub fn take_edits(&self) -> Vec<EditRequest> {
+        std::mem::take(&mut *self.shared.edits.lock())
+    }
+
+    /// Sends the client a one-sentence reason why an edit could not be made.
+    pub fn reject_edit(&self, request: &EditRequest, reason: &str) {
+        let rejected = Outgoing::Rejected { id: request.id, reason: reason.to_owned() };
+        self.queue().push_outgoing(request.client, rejected);
+    }
+
+    /// Requests an edit. Returns false if too many edits are waiting.
+    pub(crate) fn edit(&self, request: EditRequest) -> bool {
+        let mut edits = self.shared.edits.lock();
+        let has_room = edits.len() < MAX_WAITING_EDITS;
+        if has_room {
+            edits.push(request);
+        }
+        has_room
     }
 
     /// Number of connected clients.

@@ -22,6 +22,7 @@ mod chunk_sender;
 mod client_updates;
 mod clock;
 mod compact_depth;
+mod edit;
 mod error;
 #[cfg(feature = "foxglove")]
 mod foxglove_server;
@@ -56,6 +57,7 @@ mod writer;
 
 pub use access::{Role, Token, Tokens};
 pub use certificate::Certificate;
+pub use edit::{EditAction, EditRequest};
 pub use error::Error;
 #[cfg(feature = "foxglove")]
 pub use foxglove_server::FoxgloveServer;

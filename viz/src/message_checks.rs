@@ -2,14 +2,15 @@
 //! keep its limits. The fuzz target `page` calls it.
 
 use crate::clock::ServerClock;
+use crate::edit::{EditAction, EditRequest};
 use crate::negotiation::{CAPABILITIES, negotiate};
 use crate::protocol::{
-    BASE_PROTOCOL_VERSION, ClientHello, ClientMessage, MAX_RATE_HZ, PROTOCOL_VERSION, RenderMessage, ShownMessage,
-    SubscribeMessage,
+    BASE_PROTOCOL_VERSION, ClientHello, ClientMessage, EditMessage, MAX_RATE_HZ, PROTOCOL_VERSION, RenderMessage,
+    ShownMessage, SubscribeMessage,
 };
 use crate::subscriptions::{Subscriptions, fitted};
 use crate::view_request::{MAX_SIZE_PX, ViewRequest};
-use trainer::{Projection, RenderRequest};
+use trainer::{Aabb, Projection, RenderRequest};
 
 /// Handles the messages of a session, one per line, and panics if a result is inconsistent.
 pub(crate) fn check_session(session: &str) {
@@ -20,6 +21,7 @@ pub(crate) fn check_session(session: &str) {
             Ok(ClientMessage::Render(message)) => check_render(&message),
             Ok(ClientMessage::Subscribe(message)) => check_subscription(&mut subscriptions, message),
             Ok(ClientMessage::Shown(message)) => check_shown(&message),
+            Ok(ClientMessage::Edit(message)) => check_edit(&message),
             Ok(ClientMessage::Control(_) | ClientMessage::Ping(_) | ClientMessage::Goodbye(_)) | Err(_) => {}
         }
     }
@@ -54,6 +56,14 @@ fn check_shown(message: &ShownMessage) {
         assert!(shown_at >= clock.instant(0.0).expect("the start"));
         let error = (clock.millis(shown_at) - message.shown_millis).abs();
         assert!(error <= 1e-3 + 1e-12 * message.shown_millis, "{} ms became {shown_at:?}", message.shown_millis);
+    }
+}
+
+fn check_edit(message: &EditMessage) {
+    let Ok(request) = EditRequest::check(1, message) else { return };
+    if let EditAction::Erase(Aabb { world_from_box, min_m, max_m }) = request.action() {
+        assert!(kinematics::transform::is_finite(world_from_box));
+        assert!(min_m.iter().zip(max_m).all(|(min, max)| min < max && min.is_finite() && max.is_finite()));
     }
 }
 

@@ -3,7 +3,7 @@
 use crate::protocol::{BASE_PROTOCOL_VERSION, ClientHello, PROTOCOL_VERSION};
 
 /// Names of the capabilities of this server.
-pub(crate) const CAPABILITIES: [&str; 14] = [
+pub(crate) const CAPABILITIES: [&str; 15] = [
     "views",
     "subscribe",
     "compact_depth",
@@ -15,6 +15,7 @@ pub(crate) const CAPABILITIES: [&str; 14] = [
     "range_scans",
     "base_path",
     "control",
+    "edit",
     "model_chunks",
     "observations",
     "shown",

@@ -33,6 +33,8 @@ pub(crate) enum ClientMessage {
     Control(ControlMessage),
     /// Reports when a picture was shown.
     Shown(ShownMessage),
+    /// Edits a model.
+    Edit(EditMessage),
     /// Requests the server's time.
     Ping(ClientPing),
     /// The client disconnects.
@@ -49,7 +51,7 @@ impl ClientMessage {
             | Self::Shown(_)
             | Self::Ping(_)
             | Self::Goodbye(_) => Role::Viewer,
-            Self::Control(_) => Role::Operator,
+            Self::Control(_) | Self::Edit(_) => Role::Operator,
         }
     }
 }
@@ -140,6 +142,33 @@ pub(crate) struct ShownMessage {
     pub(crate) shown_millis: f64,
 }
 
+/// Fields of `edit`.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct EditMessage {
+    /// What to do.
+    pub(crate) action: EditKind,
+    /// The box to erase.
+    #[serde(rename = "box")]
+    pub(crate) erased_box: Option<BoxMessage>,
+    /// The model to edit; the first if absent.
+    pub(crate) method: Option<String>,
+    /// Number chosen by the client, repeated in the reply if the edit fails.
+    pub(crate) id: Option<u64>,
+}
+
+/// Kinds of edits.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub(crate) enum EditKind {
+    /// Erases the part of the model in a box.
+    Erase,
+    /// Erases small unconnected parts.
+    RemoveFloaters,
+    /// Undoes the last edit.
+    Undo,
+}
+
 /// Fields of `ping`.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -176,7 +205,7 @@ pub(crate) struct RenderMessage {
     /// Far limit along z.
     pub(crate) far_m: Option<f64>,
     /// Box outside which the scene is not rendered.
-    pub(crate) crop: Option<CropMessage>,
+    pub(crate) crop: Option<BoxMessage>,
     /// Requested outputs.
     pub(crate) outputs: Option<Vec<Output>>,
     /// Encoding of depth; used only with the output `depth`.
@@ -208,7 +237,7 @@ pub(crate) enum ProjectionMessage {
 /// A box with sides along the axes of its frame.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(crate) struct CropMessage {
+pub(crate) struct BoxMessage {
     /// Row major; aligned with the world axes if absent.
     pub(crate) world_from_box: Option<[f64; 16]>,
     /// Minimum corner.

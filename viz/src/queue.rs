@@ -72,6 +72,8 @@ pub(crate) enum Outgoing {
     Picture(Box<DrawnPicture>),
     /// A stage that could not be rendered.
     Failed { id: u64, view: Arc<str>, reason: String },
+    /// An edit that could not be made.
+    Rejected { id: Option<u64>, reason: String },
 }
 
 /// A rendered stage.

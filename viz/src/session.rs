@@ -4,7 +4,8 @@ use crate::Hub;
 use crate::access::Role;
 use crate::admission::Connection;
 use crate::clock::ServerClock;
-use crate::hub::Demand;
+use crate::edit::EditRequest;
+use crate::hub::{Demand, MAX_WAITING_EDITS};
 use crate::link_rate::LinkRate;
 use crate::negotiation::{Negotiated, negotiate};
 use crate::protocol::{ClientMessage, ControlMessage, ShownMessage, SubscribeMessage};
@@ -158,6 +159,14 @@ impl Reader<'_> {
                 let shown_at = self.clock.instant(shown_millis);
                 let shown_at = shown_at.ok_or(InvalidRequest::ShownTime { got: shown_millis })?;
                 self.hub.picture_shown(self.client, id, view.as_deref().unwrap_or_default(), shown_at);
+                None
+            }
+            ClientMessage::Edit(message) => {
+                let request = EditRequest::check(self.client, &message)?;
+                log::info!("client {}: {:?}", self.client, request.action());
+                if !self.hub.edit(request) {
+                    return Err(InvalidRequest::Edits { max: MAX_WAITING_EDITS });
+                }
                 None
             }
             ClientMessage::Ping(ping) => Some(Reply::Pong { t: ping.t }),

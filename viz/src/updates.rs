@@ -71,6 +71,8 @@ pub struct ModelStatus {
     pub bytes: u64,
     /// Whether the model can be sent in chunks, so that clients can draw it themselves.
     pub has_chunks: bool,
+    /// Number of edits that can be undone.
+    pub edits: usize,
     /// Mean PSNR over the test keyframes, dB; `None` before the first evaluation.
     pub psnr: Option<f64>,
     /// `(seconds, psnr)` of every evaluation so far, in order.

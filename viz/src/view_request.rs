@@ -1,7 +1,7 @@
 //! A validated render request of a client, and its stages.
 
 use crate::pose::from_row_major;
-use crate::protocol::{CropMessage, DepthFormat, Output, ProjectionMessage, RenderMessage};
+use crate::protocol::{BoxMessage, DepthFormat, Output, ProjectionMessage, RenderMessage};
 use kinematics::Transform;
 use std::sync::Arc;
 use std::time::Instant;
@@ -42,8 +42,12 @@ pub(crate) enum InvalidRequest {
         "a pinhole projection needs either focal_px above 0 or vertical_fov_rad between 0 and pi, and a finite principal_px"
     )]
     Pinhole,
-    #[error("crop needs finite corners with min_m below max_m on every axis")]
-    Crop,
+    #[error("{field} needs finite corners with min_m below max_m on every axis")]
+    Corners { field: &'static str },
+    #[error("the action erase needs box, and the other actions have none")]
+    EditBox,
+    #[error("{max} edits are waiting, which is the maximum; wait until they are applied")]
+    Edits { max: usize },
     #[error("outputs must name color, depth or both")]
     NoOutput,
     #[error("background_srgb must be three numbers from 0 to 1")]
@@ -113,7 +117,8 @@ impl ViewRequest {
                 shutter: None,
                 near_m,
                 far_m,
-                crop: message.crop.as_ref().map(checked_crop).transpose()?,
+                crop: message.crop.as_ref().map(|crop| checked_box(crop, "crop")).transpose()?,
+                edits: Arc::default(),
                 background_srgb: checked_background(message.background_srgb.unwrap_or([0.0; 3]))?,
                 appearance_of: None,
                 depth: outputs.contains(&Output::Depth),
@@ -184,7 +189,8 @@ fn checked_projection(message: &ProjectionMessage, size_px: [u32; 2]) -> Result<
     if fits { Ok(Projection::Pinhole { focal_px, principal_px }) } else { Err(InvalidRequest::Pinhole) }
 }
 
-fn checked_crop(message: &CropMessage) -> Result<Aabb, InvalidRequest> {
+/// Checks a box in the field of this name.
+pub(crate) fn checked_box(message: &BoxMessage, field: &'static str) -> Result<Aabb, InvalidRequest> {
     let world_from_box = match &message.world_from_box {
         Some(rows) => rigid(rows, "world_from_box")?,
         None => Transform::identity(),
@@ -193,7 +199,7 @@ fn checked_crop(message: &CropMessage) -> Result<Aabb, InvalidRequest> {
     if fits {
         Ok(Aabb { world_from_box, min_m: message.min_m, max_m: message.max_m })
     } else {
-        Err(InvalidRequest::Crop)
+        Err(InvalidRequest::Corners { field })
     }
 }
 

@@ -128,6 +128,10 @@ impl Writer<'_> {
                         sent?;
                         continue;
                     }
+                    Outgoing::Rejected { id, reason } => {
+                        self.send_error(id, "", &reason).await?;
+                        continue;
+                    }
                 }
             }
             let (subscriptions, settles_at) = {

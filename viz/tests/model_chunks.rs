@@ -13,6 +13,7 @@ use proxy::{Link, Proxy};
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
 use std::net::SocketAddr;
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 use trainer::{ChunkLayout, Method, ModelChunks};
 use viz::{Hub, Server, ServerConfig};
@@ -88,7 +89,7 @@ fn subscribe(client: &mut Client, method: &str) {
 }
 
 fn all_chunks(model: &mut dyn Method) -> ModelChunks {
-    model.queue_chunks(false).expect("queued").expect("not empty").finish().expect("encoded")
+    model.queue_chunks(false, &Arc::default()).expect("queued").expect("not empty").finish().expect("encoded")
 }
 
 #[test]
@@ -159,7 +160,10 @@ fn changes_arrive_and_the_copy_equals_the_model() {
     client.settle();
     let mut replica = Replica::default();
     let mut model = tsdf_model(2);
-    hub.set_model_chunks("tsdf", model.queue_chunks(true).expect("queued").expect("chunks").finish().expect("encoded"));
+    hub.set_model_chunks(
+        "tsdf",
+        model.queue_chunks(true, &Arc::default()).expect("queued").expect("chunks").finish().expect("encoded"),
+    );
     replica.receive_all(&mut client);
     let n_first = replica.chunks.len();
     let publisher = std::thread::spawn(move || {
@@ -168,7 +172,8 @@ fn changes_arrive_and_the_copy_equals_the_model() {
             while !model.is_idle() {
                 model.step(1).expect("fused");
             }
-            let changes = model.queue_chunks(true).expect("queued").expect("chunks").finish().expect("encoded");
+            let changes =
+                model.queue_chunks(true, &Arc::default()).expect("queued").expect("chunks").finish().expect("encoded");
             assert!(!changes.is_complete);
             hub.set_model_chunks("tsdf", changes);
         }

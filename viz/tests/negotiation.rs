@@ -9,6 +9,7 @@ use client::{Client, Received};
 use kinematics::{Stamp, Transform};
 use serde_json::{Value, json};
 use std::net::{SocketAddr, TcpStream};
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 use viz::{Hub, KeyframePose, LiveImage, LivePixels, PendingRender, Server, ServerConfig, Status};
 
@@ -62,6 +63,7 @@ fn camera_image(stamp: i64) -> LiveImage {
         near_m: 0.01,
         far_m: 50.0,
         crop: None,
+        edits: Arc::default(),
         background_srgb: [0.3; 3],
         appearance_of: None,
         depth: false,

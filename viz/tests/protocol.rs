@@ -16,10 +16,10 @@ use std::io::{Read, Write};
 use std::net::{SocketAddr, TcpListener, TcpStream};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
-use trainer::{ChunkData, ChunkLayout, ModelChunk, ModelChunks};
+use trainer::{Aabb, ChunkData, ChunkLayout, ModelChunk, ModelChunks};
 use viz::{
-    Control, Error, Hub, KeyframePose, LiveImage, LivePixels, ModelStatus, ObservationMap, ObservedCell, PendingRender,
-    RangeScan, SceneHint, Server, ServerConfig, Status,
+    Control, EditAction, Error, Hub, KeyframePose, LiveImage, LivePixels, ModelStatus, ObservationMap, ObservedCell,
+    PendingRender, RangeScan, SceneHint, Server, ServerConfig, Status,
 };
 
 /// Far more than loopback needs. A test that waits this long fails.
@@ -181,6 +181,7 @@ fn request_of_stage(message: &Value, header: &Value) -> trainer::RenderRequest {
         near_m: header["near_m"].as_f64().expect("near"),
         far_m: header["far_m"].as_f64().expect("far"),
         crop: None,
+        edits: Arc::default(),
         background_srgb: [0.0; 3],
         appearance_of: None,
         depth: true,
@@ -285,6 +286,49 @@ fn actions_of_operators_reach_the_run_once() {
     assert!(client.text_of("error")["message"].as_str().expect("text").contains("explode"));
     assert_eq!(hub.take_controls(), [Control::Pause, Control::Save]);
     assert_eq!(hub.take_controls(), []);
+}
+
+#[test]
+fn edits_of_operators_reach_the_run_in_order() {
+    let (hub, server) = start();
+    let mut client = Client::connect(server.address());
+    let erased = json!({"min_m": [-1, 0, 0], "max_m": [1, 0.5, 2]});
+    client.send_json(&json!({"type": "edit", "action": "erase", "box": erased, "method": "tsdf", "id": 7}));
+    client.send_json(&json!({"type": "edit", "action": "remove_floaters"}));
+    client.send_json(&json!({"type": "edit", "action": "undo", "id": 8}));
+    let flat = json!({"min_m": [0, 0, 0], "max_m": [1, 0, 1]});
+    for (message, named) in [
+        (json!({"type": "edit", "action": "erase", "id": 9}), "needs box"),
+        (json!({"type": "edit", "action": "undo", "box": erased, "id": 9}), "needs box"),
+        (json!({"type": "edit", "action": "erase", "box": flat, "id": 9}), "box needs finite corners"),
+        (json!({"type": "edit", "action": "paint", "id": 9}), "paint"),
+    ] {
+        client.send_json(&message);
+        let error = client.text_of("error");
+        assert!(error["id"] == 9 && error["message"].as_str().expect("text").contains(named), "{message}: {error}");
+    }
+    let edits = hub.take_edits();
+    let box_of = |world_from_box| Aabb { world_from_box, min_m: [-1.0, 0.0, 0.0], max_m: [1.0, 0.5, 2.0] };
+    let actions: Vec<_> = edits.iter().map(|edit| (edit.method(), *edit.action())).collect();
+    let expected = [
+        (Some("tsdf"), EditAction::Erase(box_of(Transform::identity()))),
+        (None, EditAction::RemoveFloaters),
+        (None, EditAction::Undo),
+    ];
+    assert_eq!(actions, expected);
+    hub.reject_edit(&edits[1], "there are none");
+    hub.reject_edit(&edits[2], "there is nothing to undo");
+    let errors = [client.text_of("error"), client.text_of("error")];
+    assert!(errors[0]["id"].is_null() && errors[0]["message"] == "there are none", "{errors:?}");
+    assert!(errors[1]["id"] == 8 && errors[1]["message"] == "there is nothing to undo", "{errors:?}");
+
+    // Nobody takes the edits.
+    for id in 100..=164 {
+        client.send_json(&json!({"type": "edit", "action": "undo", "id": id}));
+    }
+    let refused = client.text_of("error");
+    assert!(refused["id"] == 164 && refused["message"].as_str().expect("text").contains("64 edits"), "{refused}");
+    assert_eq!(hub.take_edits().len(), 64);
 }
 
 #[test]

@@ -187,11 +187,17 @@ fn only_operators_change_the_run() {
     let refusal = viewer.text_of("error")["message"].clone();
     assert!(refusal.as_str().is_some_and(|text| text.contains("requires the role operator")), "{refusal}");
     assert_eq!(shared.hub.take_controls(), []);
+    viewer.send(&json!({"type": "edit", "action": "undo", "id": 4}));
+    let refusal = viewer.text_of("error");
+    assert!(refusal["id"] == 4 && refusal["message"].as_str().is_some_and(|text| text.contains("role operator")));
+    assert_eq!(shared.hub.take_edits(), []);
 
     let mut operator = shared.client(&shared.operator);
     assert_eq!(operator.text_of("hello")["role"], json!("operator"));
     operator.send(&json!({"type": "control", "action": "pause"}));
-    assert!(operator.is_answered(), "the message before was read");
+    operator.send(&json!({"type": "edit", "action": "undo"}));
+    assert!(operator.is_answered(), "the messages before were read");
+    assert_eq!(shared.hub.take_edits().len(), 1);
     assert_eq!(shared.hub.take_controls(), [Control::Pause]);
     assert!(viewer.is_answered(), "a refused message does not end the connection");
 }

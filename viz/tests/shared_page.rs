@@ -6,12 +6,15 @@
 mod browser;
 
 use browser::{Browser, browser_for_page, wait_for};
+use kinematics::Transform;
 use serde_json::json;
 use std::io::{Read, Write};
 use std::net::TcpListener;
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
-use viz::{Certificate, Control, Hub, Server, ServerConfig, Sharing, Status, Tokens};
+use viz::{
+    Certificate, Control, EditAction, EditRequest, Hub, SceneHint, Server, ServerConfig, Sharing, Status, Tokens,
+};
 
 const WINDOW_PX: [u32; 2] = [1280, 760];
 const PHONE_PX: [u32; 2] = [390, 844];
@@ -59,6 +62,11 @@ fn page_uses_its_token_and_shows_its_role() {
     let is_shown = "document.getElementById('controls').hidden === false";
     wait_for(&mut browser, "the button", |browser| browser.evaluate(is_shown) == json!(true));
     assert_eq!(browser.evaluate(&format!("{pause}.disabled")), json!(true));
+    let edit = "document.getElementById('toggle-edit')";
+    wait_for(&mut browser, "the button", |browser| browser.evaluate(&format!("{edit}.hidden")) == json!(false));
+    assert_eq!(browser.evaluate(&format!("{edit}.disabled")), json!(true));
+    press(&mut browser, "q");
+    assert_eq!(browser.evaluate("document.getElementById('edit').hidden"), json!(true), "viewers cannot edit");
     let reason = browser.evaluate(&format!("{pause}.title"));
     assert!(reason.as_str().is_some_and(|reason| reason.contains("connected as viewer")), "{reason}");
     std::fs::write(scratch.join("shared-viewer.png"), browser.screenshot()).expect("written");
@@ -81,8 +89,61 @@ fn page_uses_its_token_and_shows_its_role() {
         wait_for(&mut browser, "the state", |browser| browser.text("pause") == next);
     }
     std::fs::write(scratch.join("shared-operator.png"), browser.screenshot()).expect("written");
+    edit_model(&mut browser, &hub);
+    std::fs::write(scratch.join("shared-edit.png"), browser.screenshot()).expect("written");
+    browser.resize(PHONE_PX);
+    std::fs::write(scratch.join("shared-edit-phone.png"), browser.screenshot()).expect("written");
     drop(browser);
     std::fs::remove_dir_all(&profile).expect("the browser has left its profile");
+}
+
+fn press(browser: &mut Browser, key: &str) {
+    browser.evaluate(&format!("window.dispatchEvent(new KeyboardEvent('keydown', {{ key: '{key}' }}))"));
+}
+
+/// The edits that the page sends.
+fn wait_for_edits(browser: &mut Browser, hub: &Hub) -> Vec<EditRequest> {
+    let mut edits = Vec::new();
+    wait_for(browser, "an edit", |_| {
+        edits = hub.take_edits();
+        !edits.is_empty()
+    });
+    edits
+}
+
+/// Erases the box, removes floaters and undoes edits, with buttons and with keys.
+fn edit_model(browser: &mut Browser, hub: &Hub) {
+    let (center_m, radius_m) = ([0.5, 0.0, 0.1], 2.0);
+    hub.set_scene_hint(SceneHint { center_m, radius_m, world_from_camera: Transform::translation(0.5, 0.0, -3.0) });
+    let is_enabled = "document.getElementById('toggle-edit').disabled === false";
+    wait_for(browser, "the button", |browser| browser.evaluate(is_enabled) == json!(true));
+    press(browser, "w");
+    browser.click("toggle-edit");
+    assert_eq!(hub.take_edits(), [], "keys have no effect while the panel is closed");
+    browser.click("erase-box");
+    let edits = wait_for_edits(browser, hub);
+    let EditAction::Erase(erased) = edits[0].action() else { panic!("{edits:?}") };
+    // The box is small until the user changes it: 0.3 times the radius wide, around the center.
+    for axis in 0..3 {
+        let expected = [center_m[axis] - 0.3, center_m[axis] + 0.3];
+        let got = [erased.min_m[axis], erased.max_m[axis]];
+        assert!(got.iter().zip(expected).all(|(got, expected)| (got - expected).abs() < 1e-9), "{erased:?}");
+    }
+    let set_edits = |n_edits| hub.change_status(|status| status.model.edits = n_edits);
+    assert_eq!(browser.text("undo-edit"), "Undo");
+    set_edits(3); // As the run does.
+    wait_for(browser, "the number of edits", |browser| browser.text("undo-edit") == "Undo (3)");
+    press(browser, "a");
+    assert_eq!(browser.text("edit-note"), "looking for floaters …");
+    let edits = wait_for_edits(browser, hub);
+    assert_eq!(*edits[0].action(), EditAction::RemoveFloaters);
+    hub.reject_edit(&edits[0], "no floaters found");
+    wait_for(browser, "the reason", |browser| browser.text("edit-note") == "no floaters found");
+    browser.click("undo-edit");
+    assert_eq!(*wait_for_edits(browser, hub)[0].action(), EditAction::Undo);
+    set_edits(2);
+    wait_for(browser, "the number of edits", |browser| browser.text("undo-edit") == "Undo (2)");
+    assert_eq!(browser.text("edit-note"), "");
 }
 
 /// Serves one HTML document to every request, as another site.

@@ -230,6 +230,7 @@ fn depth_request(pose: &KeyframePose) -> RenderRequest {
         near_m: 0.01,
         far_m: 100.0,
         crop: None,
+        edits: Arc::default(),
         background_srgb: [0.0; 3],
         appearance_of: None,
         depth: true,

@@ -10,7 +10,8 @@ use crate::next_commands::{DataSource, SavedModel};
 use crate::{camera_list, run_folder};
 use serde::Serialize;
 use std::path::{Path, PathBuf};
-use trainer::{Method, ModelKind};
+use std::sync::Arc;
+use trainer::{Edits, Method, ModelKind};
 
 /// A trained model that has been saved and scored and is still in GPU memory.
 pub struct FinishedModel {
@@ -18,6 +19,8 @@ pub struct FinishedModel {
     pub kind: ModelKind,
     /// The model.
     pub method: Box<dyn Method>,
+    /// Erased space.
+    pub edits: Arc<Edits>,
     /// Folder of the saved model.
     pub folder: PathBuf,
     /// Training time, seconds.
@@ -127,10 +130,11 @@ impl Session {
         // trial. An idle live run is not finished, because it may receive more keyframes after it is resumed.
         let is_live = self.persistence.keeps_keyframes();
         let is_finished = self.is_over() || (self.is_idle() && !is_live);
-        let (method, keyframes) = (self.method.as_mut(), &self.keyframes[..]);
-        let snapshot = Snapshot { method, keyframes, seconds, is_finished };
+        let (method, keyframes, edits) = (self.method.as_mut(), &self.keyframes[..], &*self.edits);
+        let snapshot = Snapshot { method, keyframes, edits, seconds, is_finished };
         let checkpoint = self.persistence.take_last_checkpoint(snapshot);
-        let saved = run_folder::save_model(self.method.as_mut(), out).and_then(|()| run_folder::checkpoint_sha256(out));
+        let saved = run_folder::save_model(self.method.as_mut(), &self.edits, out)
+            .and_then(|()| run_folder::checkpoint_sha256(out));
         self.persistence.write_checkpoint(checkpoint);
         match saved {
             Ok(sha256) => Ok(Saved { folder: out.to_owned(), sha256, failed: None }),
@@ -141,9 +145,10 @@ impl Session {
 
     /// Saves the model in a temporary folder, because its run folder could not be written.
     fn save_elsewhere(&mut self, out: &Path, save_error: crate::Error) -> crate::Result<Saved> {
+        let edits = &self.edits;
         let save = |method: &mut dyn Method| {
             let folder = run_folder::make_fallback_folder()?;
-            run_folder::save_model(method, &folder)?;
+            run_folder::save_model(method, edits, &folder)?;
             let sha256 = run_folder::checkpoint_sha256(&folder)?;
             Ok((folder, sha256))
         };
@@ -202,6 +207,7 @@ impl Session {
         Ok(FinishedModel {
             kind: self.kind(),
             method: self.method,
+            edits: self.edits,
             folder: out.to_owned(),
             seconds,
             scores: outcome.scores,

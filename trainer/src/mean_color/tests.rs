@@ -5,6 +5,7 @@ use crate::gpu::GpuOptions;
 use crate::test_scenes as scenes;
 use crate::{CommonOptions, ModelKind, ModelSpec, Projection, Resumed, load, resume};
 use kinematics::Transform;
+use std::sync::Arc;
 
 const SIZE_PX: [u32; 2] = [3, 2];
 
@@ -29,6 +30,7 @@ fn rendered(model: &mut dyn Method) -> Vec<u8> {
         near_m: 0.01,
         far_m: 10.0,
         crop: None,
+        edits: Arc::default(),
         background_srgb: [0.0; 3],
         appearance_of: None,
         depth: false,
@@ -54,7 +56,7 @@ fn registered_method_trains_saves_loads_and_resumes() {
 
     let later = gray(3, 50);
     let all = [keyframes.as_slice(), &[later]].concat();
-    let Resumed { model_spec: resumed_spec, method: mut resumed, untrained } =
+    let Resumed { model_spec: resumed_spec, method: mut resumed, untrained, .. } =
         resume(gpu.clone(), &checkpoint, &all).unwrap();
     assert_eq!((resumed_spec, untrained.len()), (model_spec, 1));
     resumed.step(60).unwrap();

@@ -5,7 +5,7 @@ use crate::view::Camera;
 use keyframe::{Keyframe, Shutter};
 use kinematics::quantile::{Rank, quantile, trimmed_range};
 use kinematics::{Transform, Twist};
-use nalgebra::{Matrix3, Point3, Vector3};
+use nalgebra::{Matrix3, Matrix4, Point3, Vector3};
 use serde::{Deserialize, Serialize};
 
 /// Depth readings per keyframe that are used to estimate the extent.
@@ -88,7 +88,12 @@ impl Extent {
         pose
     }
 
-    /// Converts all lengths of a camera to units of the radius.
+    /// Maps positions in units of the radius, relative to the center, to world, meters.
+    pub(crate) fn world_from_scene(&self) -> Matrix4<f64> {
+        Matrix4::new_translation(&self.center_m.into()) * Matrix4::new_scaling(self.radius_m)
+    }
+
+    /// Converts all lengths of a camera to units of the radius. Erased space stays in world.
     pub(crate) fn camera_in_scene_units(&self, camera: &Camera) -> Camera {
         let shutter = camera.shutter.map(|shutter| Shutter {
             twist: Twist { linear_m_s: shutter.twist.linear_m_s / self.radius_m, ..shutter.twist },

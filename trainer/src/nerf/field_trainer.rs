@@ -3,6 +3,7 @@
 use super::buffers::{
     FieldBuffers, FieldGradients, FieldMoments, ImageParamBuffers, Occupancy, RaySlot, SampleBuffers, StepBuffers,
 };
+use super::extent::Extent;
 use super::kernels::{FieldPipelines, Widths};
 use super::options::{NerfBudget, NerfOptions};
 use super::params::{
@@ -15,7 +16,7 @@ use super::sizes::{MAX_LEVELS, MIN_LEVELS, Sizes};
 use crate::gpu::{Buffer, Gpu, PassTiming, Passes, PendingRead, f32_of};
 use crate::model_options::ModelOptions;
 use crate::packing::{Output, Reader};
-use crate::view::Camera;
+use crate::view::{Camera, ErasedSpace};
 use crate::{Error, Rendered};
 use calibration::{EMBEDDING_DIM, ParamSet};
 use kinematics::random::{hash, unit_from_bits};
@@ -83,6 +84,7 @@ pub(crate) struct FieldTrainer {
     /// Rounds of samples for the next picture. If its rays need more, it is drawn again.
     picture_rounds: u32,
     reader: Reader,
+    erased: ErasedSpace,
     passes: Passes,
 }
 
@@ -134,6 +136,7 @@ impl FieldTrainer {
             picture: None,
             picture_rounds: FIRST_ROUNDS,
             reader: Reader::default(),
+            erased: ErasedSpace::none(gpu)?,
             passes: Passes::default(),
             field,
             gradients,
@@ -455,7 +458,7 @@ impl FieldTrainer {
         Ok(())
     }
 
-    /// Renders a pinhole view, given in units of the scene radius, with an appearance embedding.
+    /// Renders a pinhole view, given in units of the radius of `extent`, with an appearance embedding.
     ///
     /// Rays are sampled in rounds of a few samples, until all rays are opaque or have no occupied cells left.
     pub(crate) fn draw(
@@ -463,7 +466,7 @@ impl FieldTrainer {
         gpu: &Gpu,
         camera: &Camera,
         background_srgb: [f32; 3],
-        radius_m: f64,
+        extent: &Extent,
         embedding: [f64; EMBEDDING_DIM],
         output: Output,
     ) -> Result<Option<Rendered>, Error> {
@@ -471,9 +474,10 @@ impl FieldTrainer {
         self.make_canvas(gpu, n_pixels as u64)?;
         let Some((slot, samples, canvas)) = &self.picture else { return Err(Error::DeviceLost) };
         gpu.write(&canvas.view, 0, bytemuck::bytes_of(&camera.view()));
-        let backdrop = Backdrop { srgb: background_srgb, radius_m: f32_of(radius_m) };
+        let backdrop = Backdrop { srgb: background_srgb, radius_m: f32_of(extent.radius_m) };
         gpu.write(&canvas.backdrop, 0, bytemuck::bytes_of(&backdrop));
         gpu.write(&canvas.image_params, 0, bytemuck::cast_slice(&image_params_of(&[embedding])));
+        let erased = self.erased.set(gpu, &mut self.passes, &camera.edits, extent.world_from_scene())?;
         let Self { compiled, field, occupancy, passes: list, sizes, reader, picture_rounds, .. } = self;
         let image_params = &canvas.image_params;
         let picture_passes = FieldPasses { gpu, pipelines: &compiled.pipelines, field, samples, slot, image_params };
@@ -495,7 +499,7 @@ impl FieldTrainer {
                 }
                 picture_passes.picture_rays(list, canvas);
                 for _ in 0..*picture_rounds {
-                    picture_passes.find(list, occupancy);
+                    picture_passes.find(list, occupancy, erased);
                     picture_passes.select(list, canvas);
                     if stride == 1 {
                         picture_passes.picture_colors(list, canvas);

@@ -1,7 +1,8 @@
 // find_samples: finds the next samples of the rays of a picture, at most MAX_SAMPLES_PER_ROUND per ray.
 //
 // threads   one per ray
-// reads     march, occupied (one bit per cell), rays (target_distance: only solid cells are sampled before it)
+// reads     march, occupied (one bit per cell), rays (target_distance: only solid cells are sampled before it), erased
+//           (for points in units of the scene radius)
 // writes    rays (next_segment, first_sample, n_samples), batch (n_samples, zero before), spans, points [n_samples]
 //           (center of the sample, in the unit cube)
 // twin      nerf/reference/march.rs
@@ -15,6 +16,7 @@
 #import cell_blocks
 #import march
 #import scan
+#import erased
 
 struct SampleCounter {
     n_rays: u32,
@@ -28,6 +30,7 @@ struct SampleCounter {
 @group(0) @binding(3) var<storage, read_write> rays: array<Ray>;
 @group(0) @binding(4) var<storage, read_write> spans: array<Span>;
 @group(0) @binding(5) var<storage, read_write> points: array<vec4f>;
+@group(0) @binding(6) var<storage, read> erased: array<vec4u>;
 
 const MAX_SAMPLES_PER_ROUND = 8u;
 
@@ -47,7 +50,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
         let boxes = boxes_of(march.n_cells);
         while ix < path.n_segments && n < MAX_SAMPLES_PER_ROUND {
             let visit = visit(march, boxes, ray, path, ix, path.n_segments, free_ix);
-            if visit.is_marked {
+            if visit.is_marked && !is_erased(middle_of(march, ray, path, ix)) {
                 wg_segments[n * 256u + lane] = ix;
                 n++;
             }

@@ -73,6 +73,7 @@ const SHARED: &[Source] = &[
     shared!("network_layers"),
     shared!("occupancy_sum"),
     shared!("cell_blocks"),
+    shared!("erased"),
     shared!("ray_loss"),
     shared!("adam_rule"),
 ];

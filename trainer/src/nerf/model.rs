@@ -250,14 +250,7 @@ impl NerfModel {
         let Some((extent, field_trainer)) = &mut self.field else {
             return Ok(Rendered::empty(camera.size_px, background_srgb, output));
         };
-        field_trainer.draw(
-            &self.gpu,
-            &extent.camera_in_scene_units(camera),
-            background_srgb,
-            extent.radius_m,
-            embedding,
-            output,
-        )
+        field_trainer.draw(&self.gpu, &extent.camera_in_scene_units(camera), background_srgb, extent, embedding, output)
     }
 }
 

@@ -274,8 +274,8 @@ impl FieldPasses<'_> {
         list.dispatch(gpu, pipeline, groups(samples.n_samples, N_TILE).min(MAX_NETWORK_GROUPS), &buffers);
     }
 
-    /// Finds the next samples of a picture's rays.
-    pub(crate) fn find(&self, list: &mut Passes, occupancy: &Occupancy) {
+    /// Finds the next samples of a picture's rays, outside erased space.
+    pub(crate) fn find(&self, list: &mut Passes, occupancy: &Occupancy, erased: &Buffer) {
         let Self { gpu, pipelines, samples, slot, .. } = *self;
         list.clear_range(&samples.batch, N_SAMPLES_BYTES);
         let found = [
@@ -285,6 +285,7 @@ impl FieldPasses<'_> {
             ("rays", &slot.rays),
             ("spans", &samples.spans),
             ("points", &samples.points),
+            ("erased", erased),
         ];
         list.dispatch(gpu, &pipelines.find_samples, groups(slot.n_rays, 256), &found);
     }

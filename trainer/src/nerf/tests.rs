@@ -7,6 +7,7 @@ use super::rays::{self, RayImage, RaySampling};
 use super::reference::march::March;
 use super::sizes::Sizes;
 use super::{NerfModel, params};
+use crate::edits::{Edit, Edits};
 use crate::eval::{self, PixelPair};
 use crate::gpu::{Gpu, GpuOptions};
 use crate::model_options::{CommonOptions, ModelOptions};
@@ -623,4 +624,36 @@ fn training_continues_with_corrected_cameras() {
     }
     let report = format!("{before:.2} dB before; continued, restarted: {scores:.2?}");
     assert!(scores[0][0] > scores[0][1] + 1.0 && scores[2][0] > scores[2][1] - 0.2, "{report}");
+}
+
+#[test]
+fn erased_object_is_not_drawn() {
+    let keyframes = ball(8);
+    let mut model = trained_model(&keyframes);
+    let request = request(&keyframes[0]);
+    let render = |model: &mut NerfModel, at: f64| {
+        let world_from_box = Transform::translation(BALL_CENTER.x, BALL_CENTER.y + at, BALL_CENTER.z);
+        let mut edits = Edits::default();
+        edits.push(Edit::Box(Aabb { world_from_box, min_m: [-0.5; 3], max_m: [0.5; 3] })).unwrap();
+        model.render(&RenderRequest { edits: Arc::new(edits), ..request.clone() }).unwrap()
+    };
+    // The field is black outside the ball.
+    let is_bright = |pixel: &&[u8]| pixel[..3].iter().map(|value| u32::from(*value)).sum::<u32>() > 100;
+    let n_bright = |picture: &Picture| picture.rgba_srgb.chunks_exact(4).filter(is_bright).count();
+    let whole = model.render(&request).unwrap();
+    let [n_whole, n_erased] = [n_bright(&whole), n_bright(&render(&mut model, 0.0))];
+    assert!(n_whole > 1000 && 100 * n_erased < n_whole, "{n_whole} pixels of the ball, then {n_erased}");
+    let elsewhere = render(&mut model, 5.0);
+    assert!(elsewhere.rgba_srgb == whole.rgba_srgb && elsewhere.depth_m == whole.depth_m, "the box is empty");
+    // The near side of the ball is erased, so that its far side is drawn.
+    let to_camera = keyframes[0].world_from_camera.translation.vector - BALL_CENTER.coords;
+    let half = Transform::face_towards(&BALL_CENTER, &(BALL_CENTER + to_camera), &Vector3::z());
+    let mut edits = Edits::default();
+    edits.push(Edit::Box(Aabb { world_from_box: half, min_m: [-0.5, -0.5, 0.0], max_m: [0.5; 3] })).unwrap();
+    let far_side = model.render(&RenderRequest { edits: Arc::new(edits), ..request.clone() }).unwrap();
+    let n_farther = far_side.depth_m.iter().zip(&whole.depth_m).filter(|(far, near)| **far > **near + 0.1).count();
+    assert!(n_farther > 300, "{n_farther} pixels show the far side");
+    let undone = model.render(&request).unwrap();
+    assert!(undone.rgba_srgb == whole.rgba_srgb && undone.depth_m == whole.depth_m, "after an undo");
+    assert!(matches!(model.find_floaters(&Edits::default()), Err(Error::CannotFindFloaters)));
 }

@@ -7,6 +7,7 @@ use crate::{Error, RenderRequest};
 use kinematics::Transform;
 use nalgebra::{Rotation3, Translation3, UnitQuaternion, Vector3};
 use std::f64::consts::{FRAC_PI_2, PI};
+use std::sync::Arc;
 
 /// Number of faces.
 const N_FACES: usize = 6;
@@ -60,6 +61,7 @@ impl Face {
             near_m: request.near_m,
             far_m: request.far_m,
             crop: request.crop,
+            edits: Arc::clone(&request.edits),
             low_pass_px2: LOW_PASS_PX2,
         }
     }

@@ -63,6 +63,7 @@ fn camera_of(view: &View) -> Camera {
         near_m: view.near_m,
         far_m: 1e6,
         crop: None,
+        edits: Arc::default(),
         low_pass_px2: LOW_PASS_PX2,
     }
 }
@@ -99,6 +100,7 @@ impl KernelFixture {
             status: &self.status,
             view: &self.view,
             size_px: self.size_px,
+            erased: None,
         }
     }
 

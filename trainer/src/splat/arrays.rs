@@ -1,6 +1,8 @@
 //! Splats as plain arrays, in the layout of splat files.
 
 use crate::Error;
+use crate::edits::Edits;
+use rayon::prelude::*;
 
 /// Maximum number of color coefficients per splat (degree 3).
 const MAX_COEFFICIENTS: usize = 16;
@@ -63,6 +65,27 @@ impl SplatArrays {
     /// Number of color coefficients of one splat: 1, 4, 9 or 16.
     pub fn n_coefficients(&self) -> usize {
         (self.sh_degree as usize + 1).pow(2)
+    }
+
+    /// The splats for which `is_kept` is true of the index.
+    #[must_use]
+    pub(crate) fn filtered(&self, is_kept: impl Fn(usize) -> bool + Sync) -> Self {
+        let kept: Vec<usize> = (0..self.n_splats()).into_par_iter().filter(|ix| is_kept(*ix)).collect();
+        let n_coeffs = self.n_coefficients();
+        Self {
+            means: kept.iter().map(|ix| self.means[*ix]).collect(),
+            log_scales: kept.iter().map(|ix| self.log_scales[*ix]).collect(),
+            rotations_wxyz: kept.iter().map(|ix| self.rotations_wxyz[*ix]).collect(),
+            opacity_logits: kept.iter().map(|ix| self.opacity_logits[*ix]).collect(),
+            sh: kept.iter().flat_map(|ix| self.sh[ix * n_coeffs..(ix + 1) * n_coeffs].iter().copied()).collect(),
+            sh_degree: self.sh_degree,
+        }
+    }
+
+    /// The splats whose means are not in erased space.
+    #[must_use]
+    pub(crate) fn without_erased(self, edits: &Edits) -> Self {
+        if edits.is_empty() { self } else { self.filtered(|ix| !edits.erases(self.means[ix].map(f64::from))) }
     }
 
     fn check_lengths(&self) -> Result<(), Error> {

@@ -194,6 +194,7 @@ impl KernelBench {
             near_m: 0.01,
             far_m: 1e6,
             crop: None,
+            edits: Arc::default(),
             low_pass_px2: LOW_PASS_PX2,
         };
         let noise: Vec<u32> = (0..n_pixels)
@@ -262,6 +263,7 @@ impl KernelBench {
             status: &self.status,
             view: &self.view,
             size_px: self.size_px,
+            erased: None,
         }
     }
 

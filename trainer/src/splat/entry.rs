@@ -3,6 +3,7 @@
 use super::file::{self, Format, IN_FOLDER};
 use super::{SplatOptions, SplatTrainer};
 use crate::checkpoint::Checkpoint;
+use crate::edits::Edits;
 use crate::gpu::Gpu;
 use crate::method_entry::{Export, ExportRequest, ExportWriter, Exported, MethodEntry, SingleFile};
 use crate::model_options::{MethodOptions, ModelOptions, default_options};
@@ -72,7 +73,7 @@ fn write_spz(request: &ExportRequest<'_>) -> Result<Exported, Error> {
 
 /// Validates the splats of a model and writes them to a file.
 fn write(request: &ExportRequest<'_>, format: Format) -> Result<Exported, Error> {
-    let splats = file::read(request.model)?;
+    let splats = file::read(request.model)?.without_erased(&Edits::read(request.model)?);
     file::write(request.out, format, &splats)?;
     let detail = format!("of SH degree {}", splats.sh_degree);
     Ok(Exported { n_items: splats.n_splats() as u64, item: "splat", detail })

@@ -70,6 +70,9 @@ macro_rules! update_sources {
 /// Imports of `update` when camera parameters are also optimized.
 const WITH_CAMERA: &[Source] = update_sources!("camera_sums_tree");
 
+/// Imports of `erase`.
+const ERASE: &[Source] = &[source!("folded"), MODEL, source!("space"), source!("erased")];
+
 /// Imports of the per-pixel kernels.
 macro_rules! blend_sources {
     ($($source:expr),*) => {
@@ -145,6 +148,7 @@ fn blend(gpu: &Gpu) -> Blend {
 #[cfg(test)]
 pub(crate) const KERNELS: &[Kernel] = &[
     kernel!("project"),
+    kernel!("erase", ERASE),
     kernel!("count_bins"),
     kernel!("sum_bins"),
     kernel!("scan_bins"),
@@ -194,6 +198,7 @@ macro_rules! compile {
 pub(crate) struct DrawPipelines {
     pub(crate) sort: RadixSort,
     pub(crate) project: Pipeline,
+    pub(crate) erase: Pipeline,
     pub(crate) count_bins: Pipeline,
     pub(crate) sum_bins: Pipeline,
     pub(crate) scan_bins: Pipeline,
@@ -214,6 +219,7 @@ impl DrawPipelines {
             has_segments: blend.rasterize_segments.is_some(),
         }, {
             project: kernel!("project"), &[];
+            erase: kernel!("erase", ERASE), &[];
             count_bins: kernel!("count_bins"), &[];
             sum_bins: kernel!("sum_bins"), &[];
             scan_bins: kernel!("scan_bins"), &[];

@@ -19,9 +19,12 @@ pub mod cloud;
 mod doubling;
 #[cfg(test)]
 mod doubling_tests;
+#[cfg(test)]
+mod edit_tests;
 mod entry;
 mod few_images;
 mod file;
+mod floaters;
 mod growth_search;
 #[cfg(test)]
 mod growth_search_tests;

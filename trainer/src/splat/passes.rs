@@ -16,6 +16,8 @@ pub(crate) struct ViewPasses<'a> {
     pub(crate) status: &'a Buffer,
     pub(crate) view: &'a Buffer,
     pub(crate) size_px: [u32; 2],
+    /// Erased space; `None` in training, and if nothing is erased.
+    pub(crate) erased: Option<&'a Buffer>,
 }
 
 /// The target that a picture is compared with.
@@ -197,6 +199,10 @@ impl ViewPasses<'_> {
             ]
             .concat(),
         );
+        if let Some(erased) = self.erased {
+            let (means, keys) = (("means", &splats.means), ("depth_keys", &scratch.by_depth.keys[0]));
+            passes.dispatch(gpu, &pipelines.erase, n_blocks, &[model, means, ("erased", erased), keys]);
+        }
         pipelines.sort.sort(gpu, passes, &scratch.by_depth, status);
         let by_depth = ("by_depth", &scratch.by_depth.values[0]);
         let n_windows = u64::from(n_bins(size_px).div_ceil(WINDOW_BINS));

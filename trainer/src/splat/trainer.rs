@@ -24,6 +24,7 @@ use super::buffers::SplatBuffers;
 use super::chunks::{Chunker, MAX_SH_DEGREE};
 use super::few_images::Scarcity;
 use super::file::IN_FOLDER;
+use super::floaters::floaters;
 use super::growth_search::GrowthSearch;
 use super::kernels::TrainPipelines;
 use super::options::SplatOptions;
@@ -35,6 +36,7 @@ use super::schedule::Schedule;
 use super::seed;
 use super::trials::{CountPolicy, SplatTrials, ValidationImage};
 use crate::checkpoint::PendingCheckpoint;
+use crate::edits::{Edits, Floaters};
 use crate::gpu::{Gpu, PassTiming};
 use crate::model_chunks::PendingChunks;
 use crate::model_metadata::{METADATA_FILE, read_metadata};
@@ -321,18 +323,23 @@ impl Method for SplatTrainer {
         self.queue_view(&camera, request.background_srgb, packing)
     }
 
-    fn queue_chunks(&mut self, only_changed: bool) -> Result<Option<PendingChunks>, Error> {
+    fn queue_chunks(&mut self, only_changed: bool, edits: &Arc<Edits>) -> Result<Option<PendingChunks>, Error> {
         let splats = displayed(&self.growth_search, &self.trials, &self.model);
         if splats.n_splats == 0 {
             return Ok(None);
         }
         let gpu = Arc::clone(&self.recorder.gpu);
         let pending = splats.begin_read(&gpu, splats.active_degree().min(MAX_SH_DEGREE));
-        let chunker = Arc::clone(&self.chunker);
+        let (chunker, edits) = (Arc::clone(&self.chunker), Arc::clone(edits));
         Ok(Some(PendingChunks::new(move || {
-            let arrays = pending.finish(&gpu)?;
+            let arrays = pending.finish(&gpu)?.without_erased(&edits);
             Ok(chunker.lock().chunks(&arrays, only_changed))
         })))
+    }
+
+    fn find_floaters(&mut self, edits: &Edits) -> Result<Floaters, Error> {
+        let arrays = displayed(&self.growth_search, &self.trials, &self.model).read(&self.recorder.gpu)?;
+        floaters(&arrays.without_erased(edits)).ok_or(Error::NoFloaters)
     }
 
     fn set_watched(&mut self, watched: bool) {

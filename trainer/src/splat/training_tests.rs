@@ -18,7 +18,7 @@ const SIZE_PX: [u32; 2] = [96, 80];
 const FOCAL_PX: f64 = 90.0;
 
 /// The inside of a colorful sphere: a closed surface with well-defined depth.
-fn scene() -> SplatArrays {
+pub(super) fn scene() -> SplatArrays {
     const N_DISCS: usize = 400;
     let mut arrays = synthetic_cloud(N_DISCS, 3);
     for ix in 0..N_DISCS {
@@ -36,7 +36,7 @@ fn scene() -> SplatArrays {
     arrays
 }
 
-fn pose(ix: usize) -> Transform {
+pub(super) fn pose(ix: usize) -> Transform {
     let angle = ix as f64 * 0.12;
     let eye = Point3::new(3.2 * angle.sin(), -0.4 + 0.05 * ix as f64, -3.2 * angle.cos());
     // `face_towards` returns a frame with z forward. The rotation makes y point down.
@@ -53,6 +53,7 @@ pub(super) fn request(world_from_camera: Transform) -> RenderRequest {
         near_m: 0.01,
         far_m: 100.0,
         crop: None,
+        edits: Arc::default(),
         background_srgb: [0.0; 3],
         appearance_of: None,
         depth: true,

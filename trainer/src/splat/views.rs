@@ -304,6 +304,7 @@ pub(crate) fn camera_of(keyframe: &Keyframe) -> Camera {
         near_m: NEAR_M,
         far_m: FAR_M,
         crop: None,
+        edits: Arc::default(),
         low_pass_px2: LOW_PASS_PX2,
     }
 }

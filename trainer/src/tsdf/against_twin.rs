@@ -11,11 +11,12 @@ use super::mesh_buffers::{MeshBuffers, MeshCapacity};
 use super::params::MeshVertex;
 use super::reference::{self, BlockTriangles, Ray, Vertex, VoxelBlocks};
 use super::tests::fuse_all;
+use crate::edits::{Edit, Edits};
 use crate::gpu::{Gpu, GpuOptions};
 use crate::mismatches::Mismatches;
 use crate::model_options::ModelOptions;
 use crate::test_scenes::{self as scenes, FOCAL_PX, PRINCIPAL_PX, SIZE_PX};
-use crate::{Method, RenderRequest};
+use crate::{Aabb, Method, RenderRequest};
 use keyframe::Keyframe;
 use kinematics::Transform;
 use nalgebra::{Point3, Vector3};
@@ -149,15 +150,29 @@ fn rays(pose: &Transform, voxel_grid: &VoxelGrid) -> Vec<Ray> {
 
 #[test]
 fn pictures_match_twin() {
+    check_pictures(&Arc::default(), 2000);
+}
+
+#[test]
+fn pictures_without_erased_space_match_twin() {
+    let mut edits = Edits::default();
+    let world_from_box = scenes::look_at(Point3::new(0.3, -0.2, 0.3), Point3::new(1.0, 0.4, 0.6));
+    edits.push(Edit::Box(Aabb { world_from_box, min_m: [-0.2; 3], max_m: [0.2; 3] })).unwrap();
+    check_pictures(&Arc::new(edits), 1500);
+}
+
+/// Compares a picture with the twin's, which must contain so many pixels with a surface.
+fn check_pictures(edits: &Arc<Edits>, min_hits: usize) {
     for options in gpu_variants() {
         let keyframes = scene();
         let (blocks, voxel_grid, mut model) = fused(&options, &keyframes);
         let pose = scenes::look_at(Point3::new(1.3, 0.4, 0.6), Point3::new(0.3, -0.2, 0.1));
-        let picture = model.render(&RenderRequest { far_m: 3.0, ..scenes::request(pose) }).unwrap();
+        let picture =
+            model.render(&RenderRequest { far_m: 3.0, edits: Arc::clone(edits), ..scenes::request(pose) }).unwrap();
         let (mut n_hits, mut n_off) = (0_usize, 0_usize);
         let mut mismatches = Mismatches::default();
         for (ix, ray) in rays(&pose, &voxel_grid).iter().enumerate() {
-            let hit = reference::cast(&blocks, &voxel_grid, ray);
+            let hit = reference::cast(&blocks, &voxel_grid, ray, edits);
             let got = picture.depth_m[ix];
             n_hits += usize::from(hit.is_some());
             let rgba = &picture.rgba_srgb[4 * ix..4 * ix + 4];
@@ -172,7 +187,7 @@ fn pictures_match_twin() {
                 mismatches.check(ix, f64::from(*got), 255.0 * expected, 3.0, 0.0);
             }
         }
-        assert!(n_hits > 2000, "{n_hits}");
+        assert!(n_hits > min_hits, "{n_hits}");
         assert!((n_off as f64) < 0.01 * n_hits as f64, "{n_off} of {n_hits} pixels differ");
         mismatches.assert_none();
     }

@@ -1,7 +1,8 @@
 // cast_rays: renders the field: the first surface along each pixel's ray that faces the camera.
 //
 // threads   one per pixel, in squares of 8x8
-// reads     view (in the field's frame), field, backdrop, status (bounds), keys, entries, geometry, colors
+// reads     view (in the field's frame), field, backdrop, status (bounds), keys, entries, geometry, colors, erased (for
+//           points in voxels)
 // writes    pixels [n_pixels] (rgba8; a: 255 where there is a surface), depths [n_pixels] (meters along z; 0 without a
 //           surface)
 // twin      tsdf/reference/cast.rs
@@ -12,6 +13,8 @@
 #import field
 #import field_status
 #import field_lookup
+#import space
+#import erased
 
 struct Backdrop {
     srgb: vec4f,
@@ -27,6 +30,7 @@ struct Backdrop {
 @group(0) @binding(7) var<storage, read> colors: array<vec2u>;
 @group(0) @binding(8) var<storage, read_write> pixels: array<u32>;
 @group(0) @binding(9) var<storage, read_write> depths: array<f32>;
+@group(0) @binding(10) var<storage, read> erased: array<vec4u>;
 
 const MAX_STEPS = 4096u;
 const N_BISECTIONS = 8u;
@@ -151,7 +155,7 @@ fn crossing(ray: Ray, outside_m: f32, inside_m: f32, outside_distance: f32, insi
     return at_m;
 }
 
-// Depth of the first surface that faces the camera; UNKNOWN if there is none.
+// Depth of the first surface that faces the camera and is not erased; UNKNOWN if there is none.
 fn march(ray: Ray) -> f32 {
     let speed = length(ray.along);
     var at_m = ray.begin_m;
@@ -195,8 +199,9 @@ fn march(ray: Ray) -> f32 {
         } else {
             if outside.x >= 0.0 {
                 let found = crossing(ray, outside.x, at_m, outside.y, here, speed);
-                if found != UNKNOWN { return found; }
-                if !takes_short_steps {
+                if found != UNKNOWN {
+                    if !is_erased(ray.origin + ray.along * found) { return found; }
+                } else if !takes_short_steps {
                     short_steps_until_m = at_m + 0.5 / speed;
                     at_m = outside.x;
                     outside.x = -1.0;

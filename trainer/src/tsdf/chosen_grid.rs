@@ -6,7 +6,7 @@ use super::options::TsdfOptions;
 use keyframe::DepthMap;
 use kinematics::Transform;
 use kinematics::quantile::{Rank, quantile};
-use nalgebra::{Translation3, UnitQuaternion};
+use nalgebra::{Matrix4, Translation3, UnitQuaternion};
 use serde::{Deserialize, Serialize};
 
 /// Range of automatically chosen voxel sizes, meters.
@@ -88,6 +88,11 @@ impl VoxelGrid {
     pub fn field_from_world(&self) -> Transform {
         let [x, y, z] = self.anchor_m;
         Transform::from_parts(Translation3::new(-x, -y, -z), UnitQuaternion::identity())
+    }
+
+    /// Maps positions in voxels from the anchor to world, meters.
+    pub(crate) fn world_from_voxels(&self) -> Matrix4<f64> {
+        Matrix4::new_translation(&self.anchor_m.into()) * Matrix4::new_scaling(self.voxel_m)
     }
 }
 

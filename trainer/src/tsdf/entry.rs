@@ -4,6 +4,7 @@ use super::files::{BLOCKS_FILE, MESH_GLB, MESH_PLY};
 use super::mesh::{Mesh, write_glb, write_ply};
 use super::{TsdfModel, TsdfOptions};
 use crate::checkpoint::Checkpoint;
+use crate::edits::Edits;
 use crate::gpu::Gpu;
 use crate::method_entry::{Export, ExportRequest, ExportWriter, Exported, MethodEntry};
 use crate::model_options::{MethodOptions, ModelOptions, default_options};
@@ -67,7 +68,7 @@ fn export(
     request: &ExportRequest<'_>,
     write: fn(&Path, &Mesh) -> Result<(), Error>,
 ) -> Result<Exported, Error> {
-    let mesh = TsdfModel::load(gpu, request.model)?.mesh()?;
+    let mesh = TsdfModel::load(gpu, request.model)?.mesh_without(&Edits::read(request.model)?)?;
     let simplified = request.cell_m.map(|cell_m| (cell_m, mesh.clustered(cell_m)));
     if let Some((cell_m, simplified)) = &simplified
         && simplified.triangles.is_empty()

@@ -20,6 +20,8 @@ const SHARED: &[Source] = &[
     source!("mesh_work"),
     source!("scan"),
     source!("depth_view"),
+    source!("space"),
+    source!("erased"),
 ];
 
 macro_rules! kernel {

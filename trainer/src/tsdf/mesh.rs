@@ -3,12 +3,14 @@
 mod cases;
 mod chunks;
 mod cluster;
+mod floaters;
 mod glb;
 mod mesher;
 mod ply;
 
 pub(super) use cases::CASES;
 pub(super) use chunks::ChangedChunks;
+pub(super) use floaters::floaters;
 pub use glb::write as write_glb;
 #[cfg(test)]
 pub(super) use mesher::unit_of;

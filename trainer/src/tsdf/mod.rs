@@ -23,6 +23,8 @@ mod transfer;
 #[cfg(test)]
 mod against_twin;
 #[cfg(test)]
+mod edit_tests;
+#[cfg(test)]
 mod tests;
 
 pub use chosen_grid::VoxelGrid;

@@ -14,16 +14,18 @@ use super::bounds::bounds;
 use super::capacity::{self, BYTES_PER_BLOCK, BYTES_PER_CHUNK};
 use super::chosen_grid::VoxelGrid;
 use super::kernels::Pipelines;
-use super::mesh::Mesh;
+use super::mesh::{self, Mesh};
 use super::options::TsdfOptions;
 use super::params::status;
 use super::passes::Canvas;
 use crate::Bounds;
 use crate::checkpoint::PendingCheckpoint;
+use crate::edits::{Edits, Floaters};
 use crate::gpu::{Gpu, PassTiming, Passes};
 use crate::model_chunks::PendingChunks;
 use crate::model_options::ModelOptions;
 use crate::packing::{Format, Reader};
+use crate::view::ErasedSpace;
 use crate::{CorrectedKeyframe, Error, Method, Packing, Picture, Progress, Recalibrate, RenderRequest, Rendered};
 use calibration::Alignment;
 use calibration::CalibratedCamera;
@@ -60,6 +62,7 @@ pub struct TsdfModel {
     store: Option<FieldStore>,
     fusion: Fusion,
     canvas: Option<Canvas>,
+    erased: ErasedSpace,
     reader: Reader,
     meshing: Meshing,
 }
@@ -84,6 +87,7 @@ impl TsdfModel {
             store: None,
             fusion: Fusion::new(),
             canvas: None,
+            erased: ErasedSpace::none(&gpu)?,
             reader: Reader::default(),
             meshing: Meshing::default(),
             gpu,
@@ -124,8 +128,13 @@ impl TsdfModel {
 
     /// The current surface in world. Meshes only blocks that changed since the last call.
     pub fn mesh(&mut self) -> Result<Mesh, Error> {
+        self.mesh_without(&Edits::default())
+    }
+
+    /// [`Self::mesh`] without the triangles whose centers are in erased space.
+    pub fn mesh_without(&mut self, edits: &Edits) -> Result<Mesh, Error> {
         self.update_mesh()?;
-        Ok(self.voxel_grid().map_or_else(Mesh::default, |voxel_grid| self.meshing.mesh(voxel_grid)))
+        Ok(self.voxel_grid().map_or_else(Mesh::default, |voxel_grid| self.meshing.mesh(voxel_grid, edits)))
     }
 
     /// Meshes the blocks that changed since the last call and reads their triangles back, without joining them into one
@@ -349,11 +358,21 @@ impl Method for TsdfModel {
         })
     }
 
-    fn queue_chunks(&mut self, only_changed: bool) -> Result<Option<PendingChunks>, Error> {
+    fn queue_chunks(&mut self, only_changed: bool, edits: &Arc<Edits>) -> Result<Option<PendingChunks>, Error> {
         self.update_mesh()?;
         let Some(voxel_grid) = self.voxel_grid().cloned() else { return Ok(None) };
-        let chunks = self.meshing.take_chunks(only_changed);
+        let chunks = self.meshing.take_chunks(&voxel_grid, edits, only_changed);
         Ok(Some(PendingChunks::new(move || Ok(chunks.encode(&voxel_grid)))))
+    }
+
+    fn find_floaters(&mut self, edits: &Edits) -> Result<Floaters, Error> {
+        let mesh = self.mesh_without(edits)?;
+        let voxel_m = self.voxel_grid().map_or(1.0, |voxel_grid| voxel_grid.voxel_m);
+        mesh::floaters(&mesh, voxel_m).ok_or(Error::NoFloaters)
+    }
+
+    fn write_for_others(&mut self, folder: &Path, edits: &Edits) -> Result<(), Error> {
+        self.write_meshes(folder, edits).map(drop)
     }
 
     fn set_watched(&mut self, watched: bool) {

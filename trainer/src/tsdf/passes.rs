@@ -228,7 +228,7 @@ pub(crate) fn draw(
     list: &mut Passes,
     pipelines: &Pipelines,
     buffers: &FieldBuffers,
-    canvas: &Canvas,
+    (canvas, erased): (&Canvas, &Buffer),
     size_px: [u32; 2],
 ) {
     let [columns, rows] = size_px.map(|size| u64::from(size.div_ceil(8)));
@@ -247,6 +247,7 @@ pub(crate) fn draw(
             ("colors", &buffers.colors),
             ("pixels", &canvas.pixels),
             ("depths", &canvas.depths),
+            ("erased", erased),
         ],
     );
 }

@@ -12,7 +12,7 @@ use kinematics::{Stamp, Transform};
 use nalgebra::{Point3, Vector3};
 use std::sync::Arc;
 
-fn gpu() -> Arc<Gpu> {
+pub(super) fn gpu() -> Arc<Gpu> {
     Gpu::open(&GpuOptions::default()).unwrap()
 }
 
@@ -31,24 +31,24 @@ pub(super) fn fuse_all(model: &mut TsdfModel) {
     }
 }
 
-fn fused_model(options: ModelOptions<TsdfOptions>, keyframes: &[Arc<Keyframe>]) -> TsdfModel {
+pub(super) fn fused_model(options: ModelOptions<TsdfOptions>, keyframes: &[Arc<Keyframe>]) -> TsdfModel {
     let mut model = model_with(options, keyframes);
     fuse_all(&mut model);
     model
 }
 
-const BALL_CENTER: Point3<f64> = Point3::new(0.3, -0.2, 0.1);
+pub(super) const BALL_CENTER: Point3<f64> = Point3::new(0.3, -0.2, 0.1);
 
-fn ball_on_floor(n: usize) -> Vec<Arc<Keyframe>> {
+pub(super) fn ball_on_floor(n: usize) -> Vec<Arc<Keyframe>> {
     scenes::ring(&[scenes::ball(BALL_CENTER), scenes::floor()], BALL_CENTER, n)
 }
 
-fn same(one: &Picture, other: &Picture) -> bool {
+pub(super) fn same(one: &Picture, other: &Picture) -> bool {
     let bits = |picture: &Picture| picture.depth_m.iter().map(|depth| depth.to_bits()).collect::<Vec<_>>();
     one.rgba_srgb == other.rgba_srgb && bits(one) == bits(other)
 }
 
-fn view_of(keyframe: &Keyframe) -> Transform {
+pub(super) fn view_of(keyframe: &Keyframe) -> Transform {
     keyframe.depth.as_ref().unwrap().world_from_camera
 }
 

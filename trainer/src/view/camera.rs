@@ -1,9 +1,10 @@
 //! The camera of a view, and its uniform buffer.
 
 use crate::gpu::{f32_of, f32s_of};
-use crate::{Aabb, RenderRequest};
+use crate::{Aabb, Edits, RenderRequest};
 use keyframe::Shutter;
 use kinematics::Transform;
+use std::sync::Arc;
 
 /// Edge of a tile, pixels.
 pub(crate) const TILE_PX: u32 = 16;
@@ -40,6 +41,8 @@ pub(crate) struct Camera {
     pub(crate) near_m: f64,
     pub(crate) far_m: f64,
     pub(crate) crop: Option<Aabb>,
+    /// Erased space, in world.
+    pub(crate) edits: Arc<Edits>,
     /// Variance added to every splat on the image plane, pixels squared.
     pub(crate) low_pass_px2: f64,
 }
@@ -59,6 +62,7 @@ impl Camera {
             near_m: request.near_m,
             far_m: request.far_m,
             crop: request.crop,
+            edits: Arc::clone(&request.edits),
             low_pass_px2: LOW_PASS_PX2,
         }
     }

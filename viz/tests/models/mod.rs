@@ -129,7 +129,12 @@ fn serve(
         }
         for (name, model) in &mut models {
             if hub.chunk_period(name).is_some() && !hub.has_model_chunks(name) {
-                let chunks = model.queue_chunks(false).expect("queued").expect("not empty").finish().expect("encoded");
+                let chunks = model
+                    .queue_chunks(false, &Arc::default())
+                    .expect("queued")
+                    .expect("not empty")
+                    .finish()
+                    .expect("encoded");
                 hub.set_model_chunks(name, chunks);
             }
         }

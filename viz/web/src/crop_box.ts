@@ -1,4 +1,4 @@
-// A box around the part of the scene to draw, with a handle on each side.
+// A box around the part of the scene to draw or to erase, with a handle on each side.
 
 import * as THREE from "three";
 import type { Scene } from "./protocol";
@@ -12,6 +12,9 @@ export interface Crop {
 const COLOR = 0xe3b341;
 /** Radius of a handle, relative to its distance from the viewer. */
 const HANDLE_SIZE = 0.011;
+/** Length of the sides before the user changes them, relative to the radius of the scene. */
+const CROP_SIDE = 1.2;
+const EDIT_SIDE = 0.3;
 /** Minimum length of the sides, relative to the radius of the scene. */
 const MIN_SIDE = 0.02;
 
@@ -29,6 +32,9 @@ export class CropBox {
   private radius = 1;
   private dragged: Handle | null = null;
   private hasUserChanged = false;
+  private center = new THREE.Vector3();
+  private crops = false;
+  private edits = false;
 
   constructor(
     private readonly camera: THREE.PerspectiveCamera,
@@ -58,24 +64,46 @@ export class CropBox {
     }
   }
 
+  /** Sets whether only the part of the scene in the box is drawn. */
   set enabled(enabled: boolean) {
-    this.root.visible = enabled;
+    this.crops = enabled;
+    this.fit();
     this.changed();
   }
 
-  /** The box; undefined if it is off. */
+  /** Sets whether the box is shown so that its content can be erased. */
+  set isEditing(isEditing: boolean) {
+    if (isEditing === this.edits) return;
+    this.edits = isEditing;
+    this.fit();
+    this.changed();
+  }
+
+  /** The box to which the scene is cropped; undefined if it is not cropped. */
   get crop(): Crop | undefined {
-    if (!this.root.visible) return undefined;
+    return this.crops ? this.corners : undefined;
+  }
+
+  /** The box. */
+  get corners(): Crop {
     return { min_m: this.box.min.toArray(), max_m: this.box.max.toArray() };
   }
 
-  /** Encloses the relevant part of the scene, unless the user has changed the box. */
+  /** Sets the relevant part of the scene. */
   setScene(scene: Scene): void {
     this.radius = scene.radius_m;
-    if (this.hasUserChanged) return;
-    const center = new THREE.Vector3(...scene.center_m);
-    this.box.setFromCenterAndSize(center, new THREE.Vector3().setScalar(1.2 * scene.radius_m));
-    this.place();
+    this.center.set(...scene.center_m);
+    this.fit();
+  }
+
+  /** Shows the box if it is used. Until the user changes it, it encloses the relevant part of the scene, or its center for editing. */
+  private fit(): void {
+    this.root.visible = this.crops || this.edits;
+    if (!this.hasUserChanged) {
+      const side = (this.crops ? CROP_SIDE : EDIT_SIDE) * this.radius;
+      this.box.setFromCenterAndSize(this.center, new THREE.Vector3().setScalar(side));
+      this.place();
+    }
   }
 
   /** Gives the handles their size on the screen. */

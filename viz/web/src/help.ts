@@ -12,9 +12,11 @@ const FLY_KEYS = [
 export function setUpHelp(): void {
   const dialog = element("help", HTMLDialogElement);
   const show = (): void => {
-    const rows = [...document.querySelectorAll<HTMLButtonElement>(".toolbar button, .layers button")].flatMap((button) => {
+    const canEdit = !element("toggle-edit", HTMLButtonElement).hidden;
+    const rows = [...document.querySelectorAll<HTMLButtonElement>(".toolbar button, .layers button, .edit button")].flatMap((button) => {
       const match = /^(.*?) \((.)\)(.*)$/.exec(button.title);
-      return match && !button.hidden ? [row(match[2]!, match[1]! + match[3]!)] : [];
+      const isAvailable = !button.hidden && !button.disabled && (!button.closest(".edit") || canEdit);
+      return match && isAvailable ? [row(match[2]!, match[1]! + match[3]!)] : [];
     });
     rows.push(...FLY_KEYS.map(([key, meaning]) => row(key, meaning)));
     element("keys").replaceChildren(...rows.flat());

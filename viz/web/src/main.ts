@@ -3,6 +3,7 @@
 import { keepToken, showRole } from "./access";
 import { Banner } from "./banner";
 import { Connection } from "./connection";
+import { EditControls } from "./edit_controls";
 import { element } from "./element";
 import { showGuidance } from "./guidance";
 import { setUpHelp } from "./help";
@@ -97,6 +98,7 @@ const models = new ModelSwitch(() => {
 });
 let isDrawnLocally = false;
 const scheduler = new RenderScheduler(connection, () => view.view(), () => stages, BACKGROUND, () => models.method);
+const edits = new EditControls(connection, view.crop, () => models.method);
 const sides = [new SideView(connection, "surroundings"), new SideView(connection, "video")] as const;
 const surroundings = new Surroundings(
   sides[0],
@@ -150,6 +152,7 @@ function receiveText(message: TextMessage): void {
       view.local.removed(message);
       break;
     case "error":
+      if (edits.failed(message)) break;
       if (sides.some((side) => side.fail(message))) break;
       scheduler.failed(message.id);
       element("notice").textContent = message.message;
@@ -165,7 +168,8 @@ function receiveText(message: TextMessage): void {
 function showStatus(status: Status): void {
   const model = models.shown(status);
   readouts.show(status, model);
-  if (model.step !== latestStep) scheduler.modelChanged();
+  const isEdited = edits.show(model);
+  if (model.step !== latestStep || isEdited) scheduler.modelChanged();
   latestStep = model.step;
   updateLocalModel(model);
 }
@@ -287,9 +291,20 @@ toggle("toggle-images", "i", (isOn) => {
   element("live").hidden = !isOn;
   subscriptions.images = isOn;
 });
-const togglePanel = panels({ "toggle-layers": "layers", "toggle-settings": "settings" });
+const switchPanel = panels({ "toggle-layers": "layers", "toggle-settings": "settings", "toggle-edit": "edit" });
+const togglePanel = (button: string): void => {
+  switchPanel(button);
+  edits.opened();
+};
 action("toggle-layers", "e", () => togglePanel("toggle-layers"));
 action("toggle-settings", "v", () => togglePanel("toggle-settings"));
+action("toggle-edit", "q", () => {
+  const button = element("toggle-edit", HTMLButtonElement);
+  if (!button.hidden && !button.disabled) togglePanel("toggle-edit");
+});
+action("erase-box", "w", () => edits.eraseBox());
+action("remove-floaters", "a", () => edits.removeFloaters());
+action("undo-edit", "z", () => edits.undoLast());
 toggle("toggle-follow", "l", (isOn) => (view.follows = isOn));
 toggle("toggle-points", "p", (isOn) => {
   view.points.enabled = isOn;

@@ -17,6 +17,7 @@ export const CAPABILITIES = [
   "range_scans",
   "base_path",
   "control",
+  "edit",
   "model_chunks",
   "observations",
   "shown",
@@ -66,6 +67,8 @@ export interface ModelStatus {
   bytes: number;
   /** Whether the page can draw the model itself; missing on older servers. */
   has_chunks: boolean;
+  /** Number of edits that can be undone; missing on older servers. */
+  edits?: number;
   psnr: number | null;
   psnr_history: [number, number][];
 }
@@ -383,6 +386,15 @@ export interface ControlMessage {
   action: "pause" | "resume" | "save";
 }
 
+/** Erases parts of a model, or undoes this. */
+export interface EditMessage {
+  type: "edit";
+  id: number;
+  action: "erase" | "remove_floaters" | "undo";
+  box?: { min_m: [number, number, number]; max_m: [number, number, number] };
+  method?: string | undefined;
+}
+
 export interface RenderMessage {
   type: "render";
   id: number;
@@ -418,6 +430,7 @@ export type ClientMessage =
   | SubscribeMessage
   | ControlMessage
   | ShownMessage
+  | EditMessage
   | PingMessage;
 
 /** Header and payload of a binary message: u32 little-endian header length, JSON header, payload. */

@@ -6,9 +6,12 @@ import type { Status } from "./protocol";
 
 /** States in which a run can be controlled. */
 const CONTROLLABLE = ["waiting for images", "collecting keyframes", "training", "paused"];
+/** States in which there is a saved model, whose edits can be saved. */
+const SAVED = ["viewing", "finished"];
 
 export class RunControls {
   private isPaused = false;
+  private hasEdits = false;
 
   constructor(private readonly connection: Connection) {
     element("pause").addEventListener("click", () => {
@@ -20,6 +23,12 @@ export class RunControls {
   show(status: Status): void {
     this.isPaused = status.state === "paused";
     element("pause").textContent = this.isPaused ? "Continue" : "Pause";
-    element("controls").hidden = !this.connection.supports("control") || !CONTROLLABLE.includes(status.state);
+    const isRunning = CONTROLLABLE.includes(status.state);
+    // Undoing all edits must be saved, too.
+    this.hasEdits ||= [status, ...status.others].some((model) => (model.edits ?? 0) > 0);
+    const canSaveEdits = SAVED.includes(status.state) && this.hasEdits;
+    element("controls").hidden = !this.connection.supports("control") || !(isRunning || canSaveEdits);
+    element("pause").hidden = !isRunning;
+    element("save").textContent = isRunning ? "Save checkpoint" : "Save edits";
   }
 }

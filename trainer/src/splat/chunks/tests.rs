@@ -14,6 +14,7 @@ use crate::{
 use nalgebra::{Quaternion, UnitQuaternion};
 use std::collections::BTreeMap;
 use std::f64::consts::FRAC_1_SQRT_2;
+use std::sync::Arc;
 
 /// Splats of degree 2, like those that are read from the GPU for encoding.
 fn of_degree_2(splats: SplatArrays) -> SplatArrays {
@@ -182,11 +183,11 @@ fn pictures_of_a_trained_model_are_accurate() {
     for keyframe in &keyframes {
         trainer.push(keyframe.clone()).unwrap();
     }
-    assert!(trainer.queue_chunks(true).unwrap().is_none(), "no splats yet");
+    assert!(trainer.queue_chunks(true, &Arc::default()).unwrap().is_none(), "no splats yet");
     while trainer.progress().step < 100 {
         trainer.step(20).unwrap();
     }
-    let pending = trainer.queue_chunks(true).unwrap().unwrap();
+    let pending = trainer.queue_chunks(true, &Arc::default()).unwrap().unwrap();
     let request = request(keyframes[3].world_from_camera);
     let expected = trainer.render(&request).unwrap();
     // Later training does not affect the result.
@@ -196,10 +197,13 @@ fn pictures_of_a_trained_model_are_accurate() {
     let chunks = pending.finish().unwrap();
     let db = psnr_of(&request, &drawn(&joined(chunks.chunks.iter().map(|chunk| &chunk.fine)), &request), &expected);
     assert!(db > 36.0, "{db} dB");
-    let later = trainer.queue_chunks(true).unwrap().unwrap().finish().unwrap();
+    let later = trainer.queue_chunks(true, &Arc::default()).unwrap().unwrap().finish().unwrap();
     assert!(!later.is_complete && !later.chunks.is_empty(), "training changes splats");
-    assert!(trainer.queue_chunks(true).unwrap().unwrap().finish().unwrap().chunks.is_empty(), "nothing has changed");
-    assert!(trainer.queue_chunks(false).unwrap().unwrap().finish().unwrap().is_complete);
+    assert!(
+        trainer.queue_chunks(true, &Arc::default()).unwrap().unwrap().finish().unwrap().chunks.is_empty(),
+        "nothing has changed"
+    );
+    assert!(trainer.queue_chunks(false, &Arc::default()).unwrap().unwrap().finish().unwrap().is_complete);
 }
 
 #[test]

@@ -164,6 +164,7 @@ impl Optimizer {
             status: &self.status,
             view: if lens.is_some() { &model.cameras.corrected } else { &level.view },
             size_px: level.size_px,
+            erased: None,
         };
         Ok(PreparedView { view, level, lens })
     }

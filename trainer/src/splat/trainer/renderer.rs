@@ -8,7 +8,9 @@ use crate::splat::buffers::{ImageBuffers, Scratch, ScratchSize, SplatBuffers, n_
 use crate::splat::kernels::DrawPipelines;
 use crate::splat::params::{Camera, Supervision, View, status};
 use crate::splat::passes::ViewPasses;
+use crate::view::ErasedSpace;
 use crate::{Error, Packing, QueuedPicture, Rendered};
+use nalgebra::Matrix4;
 
 /// Minimum capacity of the bin lists, in entries.
 const MIN_ENTRIES: u32 = 1 << 14;
@@ -25,6 +27,7 @@ pub(super) struct Renderer {
     status: Buffer,
     view: Buffer,
     background: Buffer,
+    erased: ErasedSpace,
     /// Buffer for images uploaded for comparison, kept for reuse.
     compared: Option<Buffer>,
     reader: Reader,
@@ -58,6 +61,7 @@ impl Renderer {
             status: gpu.storage_with("splat.draw_status", &[0; 4 * status::LEN])?,
             view: gpu.uniform_with("splat.draw_view", &<View as bytemuck::Zeroable>::zeroed()),
             background: gpu.uniform_with("splat.background", &<Supervision as bytemuck::Zeroable>::zeroed()),
+            erased: ErasedSpace::none(gpu)?,
             compared: None,
             reader: Reader::default(),
         })
@@ -176,12 +180,14 @@ impl Renderer {
         recorder.gpu.write(&self.background, 0, bytemuck::bytes_of(&background));
         self.reserve_view(recorder, splats.capacity, size_px, false)?;
         reserve_image(recorder, &mut self.image_buffers, size_px, false)?;
+        let erased = self.erased.set(&recorder.gpu, &mut recorder.passes, &camera.edits, Matrix4::identity())?;
+        let erased = (!camera.edits.is_empty()).then_some(erased);
         let (status, view, image_buffers) =
             (&self.status, &self.view, self.image_buffers.as_ref().ok_or(Error::DeviceLost)?);
         let scratch = self.scratch.as_ref().map(|(_, scratch)| scratch).ok_or(Error::DeviceLost)?;
         let Recorder { gpu, passes: list } = recorder;
         write_n_splats(gpu, status, splats.n_splats);
-        let passes = ViewPasses { gpu, splats, scratch, image_buffers, status, view, size_px };
+        let passes = ViewPasses { gpu, splats, scratch, image_buffers, status, view, size_px, erased };
         passes.draw(list, &self.pipelines);
         passes.finish(list, &self.pipelines, &self.background);
         let mut read = vec![(status, 4 * status::LEN)];

@@ -1,14 +1,17 @@
 //! Chunks of meshes, decoded as `docs/reference/protocol.md` says.
 
+use crate::edits::{Edit, Edits};
 use crate::gpu::{Gpu, GpuOptions};
 use crate::test_scenes as scenes;
 use crate::tsdf::TsdfModel;
 use crate::tsdf::mesh::Mesh;
-use crate::{ChunkLayout, Method, ModelChunk, ModelChunks};
+use crate::{Aabb, ChunkLayout, Method, ModelChunk, ModelChunks};
 use flate2::read::ZlibDecoder;
+use kinematics::Transform;
 use nalgebra::{Point3, Vector3};
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::io::Read;
+use std::sync::Arc;
 
 /// A vertex: position in world in meters, and color.
 type Vertex = (Vector3<f64>, [u8; 3]);
@@ -107,20 +110,20 @@ fn chunks_follow_the_mesh() {
     let at = Point3::new(0.1, 0.0, 0.2);
     let keyframes = scenes::ring(&[scenes::ball(at), scenes::floor()], at, 4);
     let mut model = TsdfModel::new(Gpu::open(&GpuOptions::default()).unwrap(), scenes::options()).unwrap();
-    assert!(model.queue_chunks(false).unwrap().is_none(), "an empty model");
+    assert!(model.queue_chunks(false, &Arc::default()).unwrap().is_none(), "an empty model");
     let mut replica = Replica::default();
     for keyframe in &keyframes {
         model.push(keyframe.clone()).unwrap();
         while model.step(1).unwrap() > 0 {}
-        replica.apply(&model.queue_chunks(true).unwrap().unwrap().finish().unwrap());
+        replica.apply(&model.queue_chunks(true, &Arc::default()).unwrap().unwrap().finish().unwrap());
     }
     let voxel_m = model.voxel_grid().unwrap().voxel_m;
     let mesh = model.mesh().unwrap();
     replica.assert_equals(&mesh, voxel_m);
-    let none = model.queue_chunks(true).unwrap().unwrap().finish().unwrap();
+    let none = model.queue_chunks(true, &Arc::default()).unwrap().unwrap().finish().unwrap();
     assert!(!none.is_complete && none.chunks.is_empty() && none.removed.is_empty());
     let mut complete = Replica::default();
-    let all = model.queue_chunks(false).unwrap().unwrap().finish().unwrap();
+    let all = model.queue_chunks(false, &Arc::default()).unwrap().unwrap().finish().unwrap();
     assert!(all.is_complete);
     complete.apply(&all);
     complete.assert_equals(&mesh, voxel_m);
@@ -140,11 +143,35 @@ fn removed_surfaces_remove_chunks() {
     for keyframe in with.iter().chain(std::iter::repeat_n(&without, 4).flatten()) {
         model.push(keyframe.clone()).unwrap();
         while model.step(1).unwrap() > 0 {}
-        let new = model.queue_chunks(true).unwrap().unwrap().finish().unwrap();
+        let new = model.queue_chunks(true, &Arc::default()).unwrap().unwrap().finish().unwrap();
         n_removed += new.removed.len();
         replica.apply(&new);
     }
     assert!(n_removed > 0, "the ball is gone");
     let voxel_m = model.voxel_grid().unwrap().voxel_m;
     replica.assert_equals(&model.mesh().unwrap(), voxel_m);
+}
+
+#[test]
+fn chunks_lack_erased_triangles() {
+    let at = Point3::new(0.1, 0.0, 0.2);
+    let mut model = TsdfModel::new(Gpu::open(&GpuOptions::default()).unwrap(), scenes::options()).unwrap();
+    for keyframe in scenes::ring(&[scenes::ball(at), scenes::floor()], at, 4) {
+        model.push(keyframe).unwrap();
+    }
+    while model.step(u64::MAX).unwrap() > 0 {}
+    let mut edits = Edits::default();
+    let world_from_box = Transform::translation(at.x, at.y, at.z + 0.1);
+    edits.push(Edit::Box(Aabb { world_from_box, min_m: [-0.4; 3], max_m: [0.4; 3] })).unwrap();
+    let (none, edits) = (Arc::default(), Arc::new(edits));
+    let mut replica = Replica::default();
+    let voxel_m = model.voxel_grid().unwrap().voxel_m;
+    let n_all = model.queue_chunks(false, &none).unwrap().unwrap().finish().unwrap().chunks.len();
+    for applied in [&none, &edits, &none] {
+        let new = model.queue_chunks(!replica.chunks.is_empty(), applied).unwrap().unwrap().finish().unwrap();
+        let is_first = replica.chunks.is_empty();
+        assert!(is_first || new.chunks.len() + new.removed.len() < n_all, "only changed chunks are sent");
+        replica.apply(&new);
+        replica.assert_equals(&model.mesh_without(applied).unwrap(), voxel_m);
+    }
 }

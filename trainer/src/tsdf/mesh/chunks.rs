@@ -3,7 +3,8 @@
 //! Positions are rounded to a grid that all chunks share, so that neighboring chunks meet without gaps. Values are
 //! stored as differences to the previous one, which zlib compresses well.
 
-use super::mesher::{BlockMesh, Mesher, shared_key};
+use super::mesher::{BlockMesh, Mesher, shared_key, without_erased};
+use crate::edits::Edits;
 use crate::model_chunks::{ChunkData, ChunkLayout, ModelChunk, ModelChunks};
 use crate::tsdf::block::{BLOCK_EDGE, GridCoord};
 use crate::tsdf::chosen_grid::VoxelGrid;
@@ -34,11 +35,12 @@ struct ChunkBlocks {
 pub(in crate::tsdf) struct ChangedChunks {
     is_complete: bool,
     chunks: BTreeMap<GridCoord, ChunkBlocks>,
+    edits: Arc<Edits>,
 }
 
 impl ChangedChunks {
     /// Takes the chunks that have changed since the last call, or all of them.
-    pub(in crate::tsdf) fn take(mesher: &mut Mesher, only_changed: bool) -> Self {
+    pub(in crate::tsdf) fn take(mesher: &mut Mesher, edits: &Arc<Edits>, only_changed: bool) -> Self {
         let changed = mesher.take_changed().filter(|_| only_changed);
         let is_complete = changed.is_none();
         let mut chunks: BTreeMap<GridCoord, ChunkBlocks> = BTreeMap::new();
@@ -50,11 +52,15 @@ impl ChangedChunks {
                 chunk.blocks.push((*block, Arc::clone(mesh)));
             }
         }
-        Self { is_complete, chunks }
+        Self { is_complete, chunks, edits: Arc::clone(edits) }
     }
 
-    /// Encodes the chunks.
-    pub(in crate::tsdf) fn encode(self, voxel_grid: &VoxelGrid) -> ModelChunks {
+    /// Encodes the chunks without erased space.
+    pub(in crate::tsdf) fn encode(mut self, voxel_grid: &VoxelGrid) -> ModelChunks {
+        for chunk in self.chunks.values_mut() {
+            chunk.blocks.par_iter_mut().for_each(|(_, mesh)| *mesh = without_erased(mesh, voxel_grid, &self.edits));
+            chunk.blocks.retain(|(_, mesh)| !mesh.triangles.is_empty());
+        }
         let (present, removed): (Vec<_>, Vec<_>) =
             self.chunks.into_iter().partition(|(_, chunk)| !chunk.blocks.is_empty());
         ModelChunks {

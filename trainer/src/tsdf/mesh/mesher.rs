@@ -1,11 +1,13 @@
 //! An incrementally updated mesh: triangles per block, joined on request.
 
 use super::Mesh;
+use crate::edits::Edits;
 use crate::gpu::f32_of;
 use crate::tsdf::block::{BLOCK_EDGE, GridCoord};
 use crate::tsdf::chosen_grid::VoxelGrid;
 use crate::tsdf::params::MeshVertex;
 use nalgebra::Vector3;
+use rayon::prelude::*;
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::Arc;
 
@@ -16,10 +18,47 @@ pub(in crate::tsdf) struct BlockMesh {
     pub(in crate::tsdf) triangles: Vec<[u32; 3]>,
 }
 
+impl BlockMesh {
+    /// Whether each triangle's center is in erased space.
+    fn erased<'a>(&'a self, voxel_grid: &'a VoxelGrid, edits: &'a Edits) -> impl Iterator<Item = bool> + 'a {
+        self.triangles.iter().map(|corners| {
+            let along = |axis: usize| corners.map(|ix| f64::from(self.vertices[ix as usize].position_m[axis]));
+            let center = [0, 1, 2].map(|axis| voxel_grid.anchor_m[axis] + along(axis).iter().sum::<f64>() / 3.0);
+            edits.erases(center)
+        })
+    }
+
+    /// The triangles that are not erased, with their vertices.
+    fn without_erased(&self, voxel_grid: &VoxelGrid, edits: &Edits) -> Self {
+        let mut kept = Self { vertices: Vec::new(), triangles: Vec::new() };
+        let mut kept_ixs: Vec<Option<u32>> = vec![None; self.vertices.len()];
+        let triangles = self.triangles.iter().zip(self.erased(voxel_grid, edits));
+        for (corners, _) in triangles.filter(|(_, is_erased)| !is_erased) {
+            kept.triangles.push(corners.map(|ix| {
+                *kept_ixs[ix as usize].get_or_insert_with(|| {
+                    kept.vertices.push(self.vertices[ix as usize]);
+                    u32::try_from(kept.vertices.len() - 1).expect("not more than before")
+                })
+            }));
+        }
+        kept
+    }
+}
+
+/// The part of a block's mesh that is not erased.
+pub(super) fn without_erased(mesh: &Arc<BlockMesh>, voxel_grid: &VoxelGrid, edits: &Edits) -> Arc<BlockMesh> {
+    match !edits.is_empty() && mesh.erased(voxel_grid, edits).any(|is_erased| is_erased) {
+        true => Arc::new(mesh.without_erased(voxel_grid, edits)),
+        false => Arc::clone(mesh),
+    }
+}
+
 /// The most recent triangles of each block.
 #[derive(Debug, Default)]
 pub(in crate::tsdf) struct Mesher {
     meshes: BTreeMap<GridCoord, Arc<BlockMesh>>,
+    /// Edits with which viewers last received the mesh.
+    edits: Arc<Edits>,
     /// Blocks replaced since the last [`Self::take_changed`]; `None` before the first.
     changed: Option<BTreeSet<GridCoord>>,
 }
@@ -49,11 +88,21 @@ impl Mesher {
         self.changed.replace(BTreeSet::new())
     }
 
-    /// All triangles, in the order of their blocks; vertices shared by blocks are merged.
-    pub(in crate::tsdf) fn mesh(&self, voxel_grid: &VoxelGrid) -> Mesh {
+    /// Marks the blocks as replaced of which other triangles are erased than before.
+    pub(in crate::tsdf) fn set_edits(&mut self, voxel_grid: &VoxelGrid, edits: &Arc<Edits>) {
+        let before = std::mem::replace(&mut self.edits, Arc::clone(edits));
+        let Some(changed) = self.changed.as_mut().filter(|_| before != *edits) else { return };
+        let has_changed = |mesh: &BlockMesh| mesh.erased(voxel_grid, &before).ne(mesh.erased(voxel_grid, edits));
+        let blocks = self.meshes.par_iter().filter(|(_, mesh)| has_changed(mesh)).map(|(block_coord, _)| *block_coord);
+        changed.par_extend(blocks);
+    }
+
+    /// All triangles outside erased space, in the order of their blocks; vertices shared by blocks are merged.
+    pub(in crate::tsdf) fn mesh(&self, voxel_grid: &VoxelGrid, edits: &Edits) -> Mesh {
         let mut whole = Mesh { origin_m: voxel_grid.anchor_m, ..Mesh::default() };
         let mut shared_vertices: HashMap<(GridCoord, u32), u32> = HashMap::new();
         for (block_coord, mesh) in &self.meshes {
+            let mesh = without_erased(mesh, voxel_grid, edits);
             let mut vertex_ixs = Vec::with_capacity(mesh.vertices.len());
             for vertex in &mesh.vertices {
                 let next = u32::try_from(whole.positions_m.len()).unwrap_or(u32::MAX);

@@ -52,7 +52,10 @@ impl TsdfModel {
             None => Canvas::new(&self.gpu, n)?,
         };
         canvas.set_view(&self.gpu, &in_field.view(), background_srgb);
-        passes::draw(&self.gpu, &mut self.passes, &self.pipelines, &store.buffers, &canvas, camera.size_px);
+        let erased =
+            self.erased.set(&self.gpu, &mut self.passes, &camera.edits, store.voxel_grid.world_from_voxels())?;
+        let drawn = (&canvas, erased);
+        passes::draw(&self.gpu, &mut self.passes, &self.pipelines, &store.buffers, drawn, camera.size_px);
         self.canvas = Some(canvas);
         Ok(true)
     }

@@ -2,6 +2,7 @@
 
 use super::field_store::FieldStore;
 use crate::Error;
+use crate::edits::Edits;
 use crate::gpu::{Gpu, PassTiming};
 use crate::tsdf::block::{Blocks, GridCoord};
 use crate::tsdf::buffers::FieldBuffers;
@@ -11,6 +12,7 @@ use crate::tsdf::kernels::Pipelines;
 use crate::tsdf::mesh::{BlockMesh, ChangedChunks, Mesh, Mesher};
 use crate::tsdf::mesh_buffers::{MeshBuffers, MeshCapacity};
 use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
 
 /// Blocks per batch when not all blocks are on the GPU. Each batch gets a temporary field.
 const BLOCKS_PER_BATCH: usize = 512;
@@ -25,14 +27,20 @@ pub(super) struct Meshing {
 }
 
 impl Meshing {
-    /// The surface at the last update, in world.
-    pub(super) fn mesh(&self, voxel_grid: &VoxelGrid) -> Mesh {
-        self.mesher.mesh(voxel_grid)
+    /// The surface at the last update, in world, without erased space.
+    pub(super) fn mesh(&self, voxel_grid: &VoxelGrid, edits: &Edits) -> Mesh {
+        self.mesher.mesh(voxel_grid, edits)
     }
 
     /// Takes the chunks that have changed since the last call, or all of them.
-    pub(super) fn take_chunks(&mut self, only_changed: bool) -> ChangedChunks {
-        ChangedChunks::take(&mut self.mesher, only_changed)
+    pub(super) fn take_chunks(
+        &mut self,
+        voxel_grid: &VoxelGrid,
+        edits: &Arc<Edits>,
+        only_changed: bool,
+    ) -> ChangedChunks {
+        self.mesher.set_edits(voxel_grid, edits);
+        ChangedChunks::take(&mut self.mesher, edits, only_changed)
     }
 
     /// Meshes the blocks that changed since the last call; returns their number. No submit may be in flight.

@@ -3,11 +3,12 @@
 use super::TsdfModel;
 use super::checkpoint::{METHOD, invalid_state};
 use crate::checkpoint::{Array, Checkpoint};
+use crate::edits::Edits;
 use crate::gpu::Gpu;
 use crate::model_metadata::METADATA_FILE;
 use crate::model_options::CommonOptions;
 use crate::tsdf::files::{BLOCKS_FILE, MESH_GLB, MESH_PLY};
-use crate::tsdf::mesh::{write_glb, write_ply};
+use crate::tsdf::mesh::{Mesh, write_glb, write_ply};
 use crate::{Error, Method};
 use flate2::Compression;
 use flate2::read::DeflateDecoder;
@@ -33,14 +34,20 @@ impl TsdfModel {
         Self::of_state(gpu, &checkpoint)
     }
 
+    /// Writes the mesh without erased space, for other programs.
+    pub(super) fn write_meshes(&mut self, folder: &Path, edits: &Edits) -> Result<Mesh, Error> {
+        let mesh = self.mesh_without(edits)?;
+        write_ply(&folder.join(MESH_PLY), &mesh)?;
+        write_glb(&folder.join(MESH_GLB), &mesh)?;
+        Ok(mesh)
+    }
+
     pub(super) fn write_folder(&mut self, folder: &Path) -> Result<(), Error> {
         self.finish_in_flight()?;
         self.fuse_one()?;
         let write_error = |path: &Path, source| Error::Write { path: path.to_owned(), source };
         std::fs::create_dir_all(folder).map_err(|source| write_error(folder, source))?;
-        let mesh = self.mesh()?;
-        write_ply(&folder.join(MESH_PLY), &mesh)?;
-        write_glb(&folder.join(MESH_GLB), &mesh)?;
+        let mesh = self.write_meshes(folder, &Edits::default())?;
         let blocks = folder.join(BLOCKS_FILE);
         let (mut state, arrays) = self.state()?;
         // Other common options do not affect a field. They are reset, so that equal fields give equal files.

@@ -1,5 +1,6 @@
 //! Twin of `cast_rays.wgsl`: finds the first crossing from outside to inside with small constant steps.
 
+use crate::edits::Edits;
 use crate::tsdf::block::{Blocks, block_of, voxel_ix};
 use crate::tsdf::chosen_grid::VoxelGrid;
 use nalgebra::{Point3, Vector3};
@@ -27,8 +28,8 @@ pub struct Hit {
     pub color_srgb: [f64; 3],
 }
 
-/// The first surface along the ray that faces its origin.
-pub fn cast(blocks: &Blocks, voxel_grid: &VoxelGrid, ray: &Ray) -> Option<Hit> {
+/// The first surface along the ray that faces its origin and is not erased.
+pub fn cast(blocks: &Blocks, voxel_grid: &VoxelGrid, ray: &Ray, edits: &Edits) -> Option<Hit> {
     let at = |depth_m: f64| (ray.origin_m + ray.along * depth_m).coords / voxel_grid.voxel_m;
     let step_m = STEP_VOXELS * voxel_grid.voxel_m / ray.along.norm();
     let mut depth_m = ray.range_m[0];
@@ -37,7 +38,10 @@ pub fn cast(blocks: &Blocks, voxel_grid: &VoxelGrid, ray: &Ray) -> Option<Hit> {
         let here = distance_at(blocks, &at(depth_m));
         if let (Some((outside_m, outside)), Some(inside)) = (before, here.filter(|distance| *distance < 0.0)) {
             let hit_m = outside_m + (depth_m - outside_m) * outside / (outside - inside);
-            return Some(Hit { depth_m: hit_m, color_srgb: color_at(blocks, &at(hit_m)) });
+            let hit_in_world = ray.origin_m + ray.along * hit_m + Vector3::from(voxel_grid.anchor_m);
+            if !edits.erases(hit_in_world.coords.into()) {
+                return Some(Hit { depth_m: hit_m, color_srgb: color_at(blocks, &at(hit_m)) });
+            }
         }
         before = here.filter(|distance| *distance >= 0.0).map(|distance| (depth_m, distance));
         depth_m += step_m;

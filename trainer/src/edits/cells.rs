@@ -1,0 +1,113 @@
+//! A set of cells of a grid over all space.
+
+use super::{GROUPS_PER_EDIT, rows};
+use crate::nerf::reference::space::contract;
+use nalgebra::{Matrix4, Vector3};
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeSet;
+
+/// Maximum number of cells along an axis; indices have 30 bits.
+pub(super) const MAX_CELLS: u32 = 1024;
+
+/// A grid of cells that covers all space: cubes of equal size within a radius, and larger ones outside, as in a
+/// contracted neural field (Barron et al. 2022).
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CellGrid {
+    /// Center of the cube with equal cells, in world, meters.
+    pub center_m: [f64; 3],
+    /// Half the edge of this cube, meters.
+    pub radius_m: f64,
+    /// Number of cells along an axis. Half of them are inside the cube.
+    pub n_cells: u32,
+}
+
+impl CellGrid {
+    /// Index of the cell that contains a point in world.
+    pub fn cell_at(&self, point_m: [f64; 3]) -> u32 {
+        let n = f64::from(self.n_cells);
+        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "within the unit cube")]
+        let coord = contract(self.scaled(point_m)).map(|along| (along * n).clamp(0.0, n - 1.0) as u32);
+        self.index(coord)
+    }
+
+    /// Number of cells.
+    pub(crate) fn n(&self) -> usize {
+        (self.n_cells as usize).pow(3)
+    }
+
+    /// Width of the cells at a point along the narrower directions, meters.
+    pub(crate) fn cell_m(&self, point_m: [f64; 3]) -> f64 {
+        let largest = self.scaled(point_m).iter().fold(1.0, |largest: f64, along| largest.max(along.abs()));
+        4.0 * self.radius_m / f64::from(self.n_cells) * largest * largest / (2.0 * largest - 1.0)
+    }
+
+    /// Indices of the cells around a cell, itself excluded.
+    pub(crate) fn neighbors(&self, index: u32) -> impl Iterator<Item = u32> + use<> {
+        let (grid, n) = (*self, self.n_cells);
+        let coord = [index % n, index / n % n, index / (n * n)];
+        (0..27_u32).filter(|ix| *ix != 13).filter_map(move |ix| {
+            let steps = [ix % 3, ix / 3 % 3, ix / 9];
+            let moved = |axis: usize| (coord[axis] + steps[axis]).checked_sub(1).filter(|along| *along < n);
+            Some(grid.index([moved(0)?, moved(1)?, moved(2)?]))
+        })
+    }
+
+    fn index(&self, [x, y, z]: [u32; 3]) -> u32 {
+        x + self.n_cells * (y + self.n_cells * z)
+    }
+
+    /// A point relative to the center, in units of the radius.
+    fn scaled(&self, point_m: [f64; 3]) -> [f64; 3] {
+        std::array::from_fn(|axis| (point_m[axis] - self.center_m[axis]) / self.radius_m)
+    }
+}
+
+/// A set of at least one cell.
+#[derive(Clone, Debug, PartialEq)]
+pub struct CellSet {
+    /// The grid.
+    pub(super) grid: CellGrid,
+    /// Disjoint ranges of indices in increasing order: the first index, and the one after the last.
+    pub(super) ranges: Vec<[u32; 2]>,
+}
+
+impl CellSet {
+    /// The set of these cells.
+    pub(super) fn new(grid: CellGrid, cells: &BTreeSet<u32>) -> Self {
+        let mut ranges: Vec<[u32; 2]> = Vec::new();
+        for &cell in cells {
+            match ranges.last_mut() {
+                Some([_, end]) if *end == cell => *end += 1,
+                _ => ranges.push([cell, cell + 1]),
+            }
+        }
+        Self { grid, ranges }
+    }
+
+    /// Whether the set contains a point in world.
+    pub fn contains(&self, point_m: [f64; 3]) -> bool {
+        let cell = self.grid.cell_at(point_m);
+        let n_before = self.ranges.partition_point(|[_, end]| *end <= cell);
+        self.ranges.get(n_before).is_some_and(|[first, _]| *first <= cell)
+    }
+
+    /// The ranges, two per group of four words.
+    pub(super) fn range_words(&self) -> impl Iterator<Item = [u32; 4]> {
+        self.ranges.chunks(2).map(|pair| {
+            let [a, b] = pair[0];
+            let [c, d] = pair.get(1).copied().unwrap_or_default();
+            [a, b, c, d]
+        })
+    }
+
+    /// The data of the set: rows of the transform to units of the radius, number of cells along an axis, the group
+    /// where the ranges begin, and their number.
+    pub(super) fn words(&self, world_from_drawn: &Matrix4<f64>, first: u32) -> [[u32; 4]; GROUPS_PER_EDIT] {
+        let CellGrid { center_m, radius_m, n_cells } = self.grid;
+        let scale = Matrix4::new_scaling(1.0 / radius_m);
+        let [x, y, z] = rows(&(scale * Matrix4::new_translation(&-Vector3::from(center_m)) * world_from_drawn));
+        let n_ranges = u32::try_from(self.ranges.len()).unwrap_or(u32::MAX);
+        [x, y, z, [n_cells, 0, 0, first], [0, 0, 0, n_ranges]]
+    }
+}

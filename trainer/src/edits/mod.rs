@@ -1,0 +1,172 @@
+//! Edits of a model: space that an operator has erased.
+//!
+//! Edits do not change the model. Erased space is left out of pictures, chunks and exports, and undoing an edit shows it
+//! again.
+
+mod cells;
+mod floaters;
+mod stored;
+
+pub use cells::{CellGrid, CellSet};
+pub use floaters::Floaters;
+pub(crate) use floaters::{CellLabels, is_floater_size};
+
+use crate::{Aabb, Error};
+use nalgebra::Matrix4;
+use serde::{Deserialize, Serialize};
+use std::path::Path;
+use stored::StoredEdit;
+
+/// Maximum number of edits of a model.
+pub const MAX_EDITS: usize = 64;
+/// Name of the file in a model folder.
+const FILE: &str = "edits.json";
+/// Words of an edit in [`Edits::words`], in groups of four.
+const GROUPS_PER_EDIT: usize = 5;
+
+/// One edit.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Edit {
+    /// Erases a box.
+    Box(Aabb),
+    /// Erases cells.
+    Cells(CellSet),
+}
+
+impl Edit {
+    /// Whether a point in world is erased.
+    fn erases(&self, point_m: [f64; 3]) -> bool {
+        match self {
+            Self::Box(aabb) => aabb.contains(point_m),
+            Self::Cells(cells) => cells.contains(point_m),
+        }
+    }
+}
+
+/// The edits of a model, oldest first.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(try_from = "Vec<StoredEdit>", into = "Vec<StoredEdit>")]
+pub struct Edits(Vec<Edit>);
+
+/// Content of [`FILE`].
+#[derive(Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct File {
+    edits: Edits,
+}
+
+impl Edits {
+    /// Adds an edit.
+    ///
+    /// # Errors
+    ///
+    /// Fails if there are [`MAX_EDITS`] already.
+    pub fn push(&mut self, edit: Edit) -> Result<(), Error> {
+        if self.0.len() >= MAX_EDITS {
+            return Err(Error::TooManyEdits);
+        }
+        self.0.push(edit);
+        Ok(())
+    }
+
+    /// Removes the newest edit.
+    ///
+    /// # Errors
+    ///
+    /// Fails if there is none.
+    pub fn undo(&mut self) -> Result<(), Error> {
+        self.0.pop().map(drop).ok_or(Error::NothingToUndo)
+    }
+
+    /// Number of edits.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.0.len()
+    }
+
+    /// Whether nothing is erased.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.0.is_empty()
+    }
+
+    /// Whether a point in world, meters, is erased.
+    #[must_use]
+    pub fn erases(&self, point_m: [f64; 3]) -> bool {
+        self.0.iter().any(|edit| edit.erases(point_m))
+    }
+
+    /// Reads the edits in the folder of a saved model; none if the folder has no such file, or for a single file.
+    ///
+    /// # Errors
+    ///
+    /// Fails if the file cannot be read or is damaged.
+    pub fn read(model: &Path) -> Result<Self, Error> {
+        let path = model.join(FILE);
+        if !path.is_file() {
+            return Ok(Self::default());
+        }
+        let bytes = std::fs::read(&path).map_err(|source| Error::Read { path: path.clone(), source })?;
+        let file: File =
+            serde_json::from_slice(&bytes).map_err(|source| Error::ModelMetadata { path: path.clone(), source })?;
+        Ok(file.edits)
+    }
+
+    /// Writes the edits into the folder of a saved model. Without edits, removes the file.
+    ///
+    /// # Errors
+    ///
+    /// Fails if the file cannot be written or removed.
+    pub fn write(&self, folder: &Path) -> Result<(), Error> {
+        let path = folder.join(FILE);
+        if self.is_empty() {
+            return match std::fs::remove_file(&path) {
+                Err(source) if source.kind() != std::io::ErrorKind::NotFound => Err(Error::Write { path, source }),
+                _ => Ok(()),
+            };
+        }
+        let text = serde_json::to_string(&File { edits: self.clone() });
+        let text = text.map_err(|error| Error::Write { path: path.clone(), source: error.into() })?;
+        crate::atomic_file::write(&path, |file| std::io::Write::write_all(file, format!("{text}\n").as_bytes()))
+    }
+
+    /// The data of shared/erased.wgsl, for kernels whose points are in a frame, and in units, other than the world's.
+    ///
+    /// * `world_from_drawn`: maps points of the kernel to world, meters.
+    pub(crate) fn words(&self, world_from_drawn: &Matrix4<f64>) -> Vec<[u32; 4]> {
+        let n = u32::try_from(self.len()).expect("at most 64");
+        let mut words = vec![[n, 0, 0, 0]];
+        let mut ranges: Vec<[u32; 4]> = Vec::new();
+        let first_range = 1 + GROUPS_PER_EDIT * self.len();
+        for edit in &self.0 {
+            words.extend(match edit {
+                Edit::Box(aabb) => box_words(aabb, world_from_drawn),
+                Edit::Cells(cells) => {
+                    let first = u32::try_from(first_range + ranges.len()).unwrap_or(u32::MAX);
+                    ranges.extend(cells.range_words());
+                    cells.words(world_from_drawn, first)
+                }
+            });
+        }
+        words.extend(ranges);
+        words
+    }
+}
+
+/// The data of a box: rows of its transform, and its corners. A last word of 0 marks a box.
+fn box_words(aabb: &Aabb, world_from_drawn: &Matrix4<f64>) -> [[u32; 4]; GROUPS_PER_EDIT] {
+    let [x, y, z] = rows(&(aabb.world_from_box.inverse().to_homogeneous() * world_from_drawn));
+    let corner = |corner_m: [f64; 3]| {
+        let [x, y, z] = crate::gpu::f32s_of(corner_m).map(f32::to_bits);
+        [x, y, z, 0]
+    };
+    [x, y, z, corner(aabb.min_m), corner(aabb.max_m)]
+}
+
+/// The upper three rows of a matrix, as bits of f32.
+fn rows(matrix: &Matrix4<f64>) -> [[u32; 4]; 3] {
+    std::array::from_fn(|row| std::array::from_fn(|column| crate::gpu::f32_of(matrix[(row, column)]).to_bits()))
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,49 @@
+// erased: space that an operator has erased. Import after `space` and `erased` of the kernel: an array of vec4u.
+//
+// The first group of words holds the number of edits. Five groups per edit follow: three rows of a transform, and two
+// groups that depend on the kind of edit. For a box, they are its corners, and the last word is 0. For cells, they are
+// the number of cells along an axis, the group at which ranges of cells begin, and in the last word their number.
+//
+// twin      edits/mod.rs
+
+const GROUPS_PER_EDIT = 5u;
+
+fn row_of_edit(group: u32, point: vec4f) -> f32 {
+    return dot(bitcast<vec4f>(erased[group]), point);
+}
+
+// A range of cells: the first one, and the one after the last.
+fn erased_range(first: u32, ix: u32) -> vec2u {
+    let pair = erased[first + ix / 2u];
+    return select(pair.xy, pair.zw, (ix & 1u) == 1u);
+}
+
+// Whether the cell around a point, in units of the radius, is in one of the ranges, which are in increasing order.
+fn is_in_cells(point: vec3f, n_cells: u32, first: u32, n_ranges: u32) -> bool {
+    let coord = min(vec3u(contract(point) * f32(n_cells)), vec3u(n_cells - 1u));
+    let cell = coord.x + n_cells * (coord.y + n_cells * coord.z);
+    var low = 0u;
+    var high = n_ranges;
+    while low < high {
+        let middle = (low + high) / 2u;
+        if erased_range(first, middle).y <= cell { low = middle + 1u; } else { high = middle; }
+    }
+    return low < n_ranges && erased_range(first, low).x <= cell;
+}
+
+fn is_erased(at: vec3f) -> bool {
+    let n_edits = erased[0].x;
+    for (var ix = 0u; ix < n_edits; ix++) {
+        let group = 1u + GROUPS_PER_EDIT * ix;
+        let homogeneous = vec4f(at, 1.0);
+        let point = vec3f(row_of_edit(group, homogeneous), row_of_edit(group + 1u, homogeneous), row_of_edit(group + 2u, homogeneous));
+        let a = erased[group + 3u];
+        let b = erased[group + 4u];
+        if b.w == 0u {
+            if all(point >= bitcast<vec3f>(a.xyz)) && all(point <= bitcast<vec3f>(b.xyz)) { return true; }
+        } else if is_in_cells(point, a.x, a.w, b.w) {
+            return true;
+        }
+    }
+    return false;
+}

@@ -1,0 +1,119 @@
+//! Finds small parts of a splat model that are not connected to its large parts.
+//!
+//! Space is divided into cells. A cell is occupied if its splats, together, are about half opaque; groups of adjacent
+//! occupied cells are the parts of the model. Splats that are too faint to occupy a cell are floaters, too, unless they are
+//! next to a large part.
+
+use super::arrays::SplatArrays;
+use super::bounds::bounds;
+use crate::Bounds;
+use crate::edits::{CellGrid, CellLabels, Floaters};
+use crate::gpu::f32_of;
+use nalgebra::{Quaternion, UnitQuaternion, Vector3};
+use std::collections::BTreeSet;
+
+/// Cells along an axis: cells within the radius of the scene are 2 % of it wide.
+const N_CELLS: u32 = 200;
+/// Sum of opacities above which a cell is occupied.
+const MIN_CELL_OPACITY: f32 = 0.5;
+/// Splats cover cells up to this many standard deviations.
+const REACH: f64 = 2.0;
+/// Maximum number of sampled points of one splat, and of all splats: some seconds on one core.
+const MAX_SAMPLES: f64 = 16_384.0;
+const MAX_TOTAL_SAMPLES: f64 = 5e7;
+/// Splats that are more transparent are not drawn, see shared/projection.wgsl.
+const MIN_ALPHA: f64 = 1.0 / 255.0;
+
+/// The small parts of a splat model; `None` if there are none.
+pub(super) fn floaters(splats: &SplatArrays) -> Option<Floaters> {
+    let Bounds { center_m, radius_m } = bounds(splats)?;
+    let grid = CellGrid { center_m, radius_m, n_cells: N_CELLS };
+    let is_visible = |ix: &usize| opacity(splats, *ix) > MIN_ALPHA && is_finite(splats, *ix);
+    let visible: Vec<usize> = (0..splats.n_splats()).filter(is_visible).collect();
+    let occupied = occupied(splats, &visible, &grid);
+    let mut labels = CellLabels::of_occupied(&grid, &occupied);
+    labels.keep_around(&grid);
+    let mean_m = |ix: usize| splats.means[ix].map(f64::from);
+    let cells = visible.iter().map(|ix| grid.cell_at(mean_m(*ix)));
+    let faint: BTreeSet<u32> = cells.filter(|cell| !labels.kept.contains(cell)).collect();
+    labels.floating.extend(faint);
+    let cells = labels.erased(&grid)?;
+    let n_erased = visible.iter().filter(|ix| cells.contains(mean_m(**ix))).count() as u64;
+    (n_erased > 0).then_some(Floaters { cells, n_erased, item: "splat" })
+}
+
+/// The occupied cells.
+fn occupied(splats: &SplatArrays, visible: &[usize], grid: &CellGrid) -> BTreeSet<u32> {
+    let steps: Vec<[f64; 3]> = visible.iter().map(|ix| n_steps(splats, *ix, grid)).collect();
+    let total = |max: f64| steps.iter().map(|steps| n_samples(steps).min(max)).sum::<f64>();
+    let mut max_samples = MAX_SAMPLES;
+    while max_samples > 1.0 && total(max_samples) > MAX_TOTAL_SAMPLES {
+        max_samples /= 2.0;
+    }
+    let mut opacities = vec![0.0_f32; grid.n()];
+    // The last splat that covers a cell, counted from 1: each splat counts once.
+    let mut last_splat = vec![0_u32; grid.n()];
+    for (number, (&ix, steps)) in (1..).zip(visible.iter().zip(&steps)) {
+        for (point_m, falloff) in samples(splats, ix, &limited(steps, max_samples)) {
+            let cell = grid.cell_at(point_m) as usize;
+            if std::mem::replace(&mut last_splat[cell], number) != number {
+                opacities[cell] += f32_of(falloff * opacity(splats, ix));
+            }
+        }
+    }
+    let is_occupied = |(_, opacity): &(u32, &f32)| **opacity >= MIN_CELL_OPACITY;
+    (0..).zip(&opacities).filter(is_occupied).map(|(cell, _)| cell).collect()
+}
+
+/// For each axis of a splat, the number of steps of about a cell from its center to its end.
+fn n_steps(splats: &SplatArrays, ix: usize, grid: &CellGrid) -> [f64; 3] {
+    let cell_m = grid.cell_m(splats.means[ix].map(f64::from));
+    splats.log_scales[ix].map(|log_scale| (REACH * f64::from(log_scale).exp() / cell_m).round())
+}
+
+/// Number of points of a splat with so many steps per axis.
+fn n_samples(steps: &[f64; 3]) -> f64 {
+    steps.iter().map(|n| 2.0 * n + 1.0).product()
+}
+
+/// The steps of a splat, fewer if it has more than `max_samples` points.
+fn limited(steps: &[f64; 3], max_samples: f64) -> [f64; 3] {
+    let n_axes = steps.iter().filter(|n| **n > 0.0).count().max(1);
+    let factor = (max_samples / n_samples(steps)).min(1.0).powf(1.0 / n_axes as f64);
+    steps.map(|n| ((factor * (2.0 * n + 1.0) - 1.0) / 2.0).floor().max(0.0))
+}
+
+/// Points of a splat in world, meters, those near its center first along each axis, and the falloff of opacity there.
+fn samples(splats: &SplatArrays, ix: usize, steps: &[f64; 3]) -> impl Iterator<Item = ([f64; 3], f64)> + use<> {
+    let [w, x, y, z] = splats.rotations_wxyz[ix].map(f64::from);
+    let rotation = UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z));
+    let deviations_m = splats.log_scales[ix].map(|log_scale| f64::from(log_scale).exp());
+    let mean_m = Vector3::from(splats.means[ix].map(f64::from));
+    let [xs, ys, zs] = steps.map(offsets);
+    let offsets = zs.into_iter().flat_map(move |z| {
+        let xs = xs.clone();
+        ys.clone().into_iter().flat_map(move |y| xs.clone().into_iter().map(move |x| [x, y, z]))
+    });
+    offsets.map(move |offset| {
+        let in_splat = Vector3::from(std::array::from_fn::<f64, 3, _>(|axis| offset[axis] * deviations_m[axis]));
+        let squared: f64 = offset.iter().map(|deviations| deviations * deviations).sum();
+        ((mean_m + rotation * in_splat).into(), (-0.5 * squared).exp())
+    })
+}
+
+/// Positions along an axis of a splat, in standard deviations: 0, then alternating on both sides.
+fn offsets(n_steps: f64) -> Vec<f64> {
+    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a small whole number")]
+    let n = n_steps as u32;
+    let both = |step: u32| [1.0, -1.0].map(|sign| sign * REACH * f64::from(step) / n_steps);
+    std::iter::once(0.0).chain((1..=n).flat_map(both)).collect()
+}
+
+fn opacity(splats: &SplatArrays, ix: usize) -> f64 {
+    1.0 / (1.0 + (-f64::from(splats.opacity_logits[ix])).exp())
+}
+
+fn is_finite(splats: &SplatArrays, ix: usize) -> bool {
+    let shape = splats.means[ix].iter().chain(&splats.log_scales[ix]).chain(&splats.rotations_wxyz[ix]);
+    shape.clone().all(|value| value.is_finite())
+}

@@ -1,0 +1,50 @@
+//! Edits of a model that operators request.
+
+use crate::protocol::{EditKind, EditMessage};
+use crate::view_request::{InvalidRequest, checked_box};
+use trainer::Aabb;
+
+/// What an operator wants to change.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum EditAction {
+    /// Erases the part of the model in a box.
+    Erase(Aabb),
+    /// Erases small parts that are not connected to the large parts of the model.
+    RemoveFloaters,
+    /// Undoes the last edit.
+    Undo,
+}
+
+/// A validated request to edit a model.
+#[derive(Clone, Debug, PartialEq)]
+pub struct EditRequest {
+    /// The client that sent it.
+    pub(crate) client: u64,
+    /// Number chosen by the client, repeated in the reply if the edit fails.
+    pub(crate) id: Option<u64>,
+    method: Option<String>,
+    action: EditAction,
+}
+
+impl EditRequest {
+    /// Validates a client's message.
+    pub(crate) fn check(client: u64, message: &EditMessage) -> Result<Self, InvalidRequest> {
+        let action = match (message.action, &message.erased_box) {
+            (EditKind::Erase, Some(erased_box)) => EditAction::Erase(checked_box(erased_box, "box")?),
+            (EditKind::RemoveFloaters, None) => EditAction::RemoveFloaters,
+            (EditKind::Undo, None) => EditAction::Undo,
+            _ => return Err(InvalidRequest::EditBox),
+        };
+        Ok(Self { client, id: message.id, method: message.method.clone(), action })
+    }
+
+    /// The model to edit; the first if `None`. The name comes from the client and may not exist.
+    pub fn method(&self) -> Option<&str> {
+        self.method.as_deref()
+    }
+
+    /// What to change. Coordinates are in the world of the page.
+    pub fn action(&self) -> &EditAction {
+        &self.action
+    }
+}
