@@ -23,6 +23,10 @@ const SIZE_PX: [u32; 2] = [96, 72];
 /// Upper bound on the difference caused by JPEG compression, as in `tests/view.rs`.
 const MAX_JPEG_DIFFERENCE: f64 = 3.0;
 
+/// Upper bound on the brightness in the middle of erased space: splats outside extend into it. Measured 9, and above 50
+/// before.
+const MAX_ERASED_BRIGHTNESS: f64 = 20.0;
+
 /// A command that serves the page.
 struct Serving {
     process: Child,
@@ -197,7 +201,11 @@ fn edits_of_saved_models_are_drawn_saved_exported_and_undone() {
         let edited = operator.picture(method, &pose);
         let [center, corner] = [[48, 36], [10, 10]];
         assert!(brightness_around(&whole, center) > 50.0, "{method}: {}", brightness_around(&whole, center));
-        assert!(brightness_around(&edited, center) < 2.0, "{method}: {}", brightness_around(&edited, center));
+        assert!(
+            brightness_around(&edited, center) < MAX_ERASED_BRIGHTNESS,
+            "{method}: {}",
+            brightness_around(&edited, center)
+        );
         let kept = brightness_around(&edited, corner) - brightness_around(&whole, corner);
         assert!(kept.abs() < 3.0, "{method}: the corner has changed by {kept}");
         let unsaved = rendered(folder, &model, &pose, &format!("{method}-unsaved"));
@@ -229,7 +237,10 @@ fn edits_of_saved_models_are_drawn_saved_exported_and_undone() {
     let again = Serving::start(folder, &["view", "all/splat"]);
     let mut operator = Operator::connect(&again);
     operator.wait_for(|message, _| (message["type"] == "status" && message["edits"] == 1).then_some(()));
-    assert!(brightness_around(&operator.picture("splat", &pose), [48, 36]) < 2.0, "the saved edits are drawn");
+    assert!(
+        brightness_around(&operator.picture("splat", &pose), [48, 36]) < MAX_ERASED_BRIGHTNESS,
+        "the saved edits are drawn"
+    );
     again.interrupt();
 }
 
@@ -239,13 +250,12 @@ fn edits_of_a_live_run_are_kept_in_its_checkpoint_and_model() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
     small_rig::write(folder, small_rig::Pace::RealTime);
-    let run = ["run", "rig.toml", "--sim", "--method", "tsdf"];
     let pose = json!([1, 0, 0, 0.5, 0, -1, 0, 0, 0, 0, -1, 0.6, 0, 0, 0, 1]);
     // The camera is at (0.5, 0, 0.6) and looks down at the table.
     let erase = json!({"action": "erase", "box": {"min_m": [0.4, -0.1, -0.3], "max_m": [0.6, 0.1, 0.4]}});
     let center = [48, 36];
 
-    let live = Serving::start(folder, &[&run[..], &["--out", "live"]].concat());
+    let live = Serving::start(folder, &["run", "rig.toml", "--sim", "--method", "tsdf", "--out", "live"]);
     let mut operator = Operator::connect(&live);
     operator.wait_for(|message, _| (message["type"] == "status" && message["step"].as_u64() >= Some(8)).then_some(()));
     let is_drawn = |operator: &mut Operator| brightness_around(&operator.picture("tsdf", &pose), center) > 10.0;
@@ -263,7 +273,7 @@ fn edits_of_a_live_run_are_kept_in_its_checkpoint_and_model() {
     assert_eq!(edits.len(), 1);
     assert!(Checkpoint::read(&folder.join("live/training.ckpt")).expect("a checkpoint").edits == edits);
 
-    let resumed = Serving::start(folder, &[&run[..], &["--resume", "live", "--out", "resumed"]].concat());
+    let resumed = Serving::start(folder, &["run", "rig.toml", "--sim", "--resume", "live", "--out", "resumed"]);
     let mut operator = Operator::connect(&resumed);
     operator.wait_for(|message, _| (message["type"] == "status" && message["edits"] == 1).then_some(()));
     assert!(!is_drawn(&mut operator), "the resumed run continues with the edits");

@@ -1,12 +1,13 @@
 //! Finds floaters: small parts of a model that are not connected to its large parts.
 
 use super::cells::{CellGrid, CellSet};
-use std::collections::BTreeSet;
+use super::groups::Groups;
+use std::collections::{BTreeMap, BTreeSet};
 
 /// A part with less than this fraction (1 / divisor) of the cells or triangles of the whole is a floater.
 ///
 /// In a room of radius R, this is a patch of surface about 0.16 R wide. Without scale, it resembles the diameter of
-/// 10 % of the scene below which MeshLab removes isolated pieces by default.
+/// 10 % of the scene below which `MeshLab` removes isolated pieces by default.
 const SIZE_DIVISOR: usize = 500;
 
 /// Whether a part of this size is a floater.
@@ -35,21 +36,18 @@ pub(crate) struct CellLabels {
 }
 
 impl CellLabels {
-    /// Divides occupied cells into groups of adjacent cells. Groups with few cells are floaters.
-    pub(crate) fn of_occupied(grid: &CellGrid, occupied: &BTreeSet<u32>) -> Self {
-        let mut unvisited = occupied.clone();
-        let mut labels = Self::default();
-        while let Some(first) = unvisited.pop_first() {
-            let mut group = vec![first];
-            let mut next = 0;
-            while let Some(&cell) = group.get(next) {
-                next += 1;
-                group.extend(grid.neighbors(cell).filter(|neighbor| unvisited.remove(neighbor)));
-            }
-            let is_floater = is_floater_size(group.len(), occupied.len());
-            if is_floater { &mut labels.floating } else { &mut labels.kept }.extend(group);
+    /// Divides occupied cells into groups, after connecting adjacent ones. Groups with few cells are floaters.
+    pub(crate) fn of_occupied(grid: &CellGrid, occupied: &BTreeSet<u32>, mut groups: Groups) -> Self {
+        for cell in occupied {
+            grid.neighbors(*cell).filter(|other| occupied.contains(other)).for_each(|other| groups.join(*cell, other));
         }
-        labels
+        let mut sizes: BTreeMap<u32, usize> = BTreeMap::new();
+        for cell in occupied {
+            *sizes.entry(groups.representative(*cell)).or_default() += 1;
+        }
+        let (floating, kept) =
+            occupied.iter().partition(|cell| is_floater_size(sizes[&groups.representative(**cell)], occupied.len()));
+        Self { kept, floating }
     }
 
     /// Also keeps the cells around those of large parts.

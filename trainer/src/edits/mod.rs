@@ -5,11 +5,13 @@
 
 mod cells;
 mod floaters;
+mod groups;
 mod stored;
 
 pub use cells::{CellGrid, CellSet};
 pub use floaters::Floaters;
 pub(crate) use floaters::{CellLabels, is_floater_size};
+pub(crate) use groups::Groups;
 
 use crate::{Aabb, Error};
 use nalgebra::Matrix4;

@@ -1,6 +1,6 @@
 //! Tests of edits as data; the tests of each method draw them.
 
-use super::{CellGrid, CellLabels, CellSet, Edit, Edits, MAX_EDITS};
+use super::{CellGrid, CellLabels, CellSet, Edit, Edits, Groups, MAX_EDITS};
 use crate::{Aabb, Error};
 use kinematics::Transform;
 use nalgebra::Vector3;
@@ -59,13 +59,17 @@ fn small_groups_of_cells_are_floaters() {
     let cell = |x: u32, y: u32, z: u32| x + 40 * (y + 40 * z);
     let mut occupied: BTreeSet<u32> = (5..35).flat_map(|x| (5..35).map(move |y| cell(x, y, 10))).collect();
     occupied.extend([cell(4, 4, 11), cell(20, 20, 14)]);
-    let labels = CellLabels::of_occupied(&GRID, &occupied);
+    let labels = CellLabels::of_occupied(&GRID, &occupied, Groups::new(GRID.n()));
     assert_eq!((labels.floating.len(), labels.kept.len()), (1, 901));
     let erased = labels.erased(&GRID).unwrap();
     let n_erased: u32 = erased.ranges.iter().map(|[first, end]| end - first).sum();
     assert_eq!(n_erased, 27, "the floater and the cells around it");
+    let mut connected = Groups::new(GRID.n());
+    connected.join(cell(20, 20, 14), cell(20, 20, 10));
+    assert!(CellLabels::of_occupied(&GRID, &occupied, connected).erased(&GRID).is_none(), "connected by a splat");
     occupied.insert(cell(21, 20, 14));
-    assert!(CellLabels::of_occupied(&GRID, &occupied).erased(&GRID).is_none(), "more than one in 500");
+    let labels = CellLabels::of_occupied(&GRID, &occupied, Groups::new(GRID.n()));
+    assert!(labels.erased(&GRID).is_none(), "more than one in 500");
 }
 
 #[test]
@@ -93,7 +97,7 @@ fn damaged_files_are_rejected_with_the_reason() {
     let grid = r#""grid": {"center_m": [0, 0, 0], "radius_m": 1, "n_cells": 10}"#;
     let pose = "[1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]";
     for (edits, named) in [
-        ("[", "EOF"),
+        ("[", "expected value"),
         (r#"[{"ball": {}}]"#, "ball"),
         (r#"[{"box": {"world_from_box": [0], "min_m": [0, 0, 0], "max_m": [1, 1, 1]}}]"#, "16"),
         (&format!(r#"[{{"box": {{"world_from_box": {pose}, "min_m": [0, 0, 0], "max_m": [1, 0, 1]}}}}]"#), "corners"),

@@ -161,7 +161,8 @@ fn background_far_away_is_not_a_floater() {
         arrays.sh.extend_from_within(16 * ix..16 * (ix + 1));
     }
     let found = model_of(&arrays).find_floaters(&Edits::default());
-    assert!(matches!(found, Err(Error::NoFloaters)), "{found:?}");
+    let n_erased = found.map_or(0, |found| found.n_erased);
+    assert_eq!(n_erased, 0);
 }
 
 /// Prints how long a search takes: `cargo test --release -- --ignored --nocapture time_of_a_search`.

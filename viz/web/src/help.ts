@@ -15,7 +15,7 @@ export function setUpHelp(): void {
     const canEdit = !element("toggle-edit", HTMLButtonElement).hidden;
     const rows = [...document.querySelectorAll<HTMLButtonElement>(".toolbar button, .layers button, .edit button")].flatMap((button) => {
       const match = /^(.*?) \((.)\)(.*)$/.exec(button.title);
-      const isAvailable = !button.hidden && !button.disabled && (!button.closest(".edit") || canEdit);
+      const isAvailable = !button.hidden && (!button.closest(".edit") || canEdit);
       return match && isAvailable ? [row(match[2]!, match[1]! + match[3]!)] : [];
     });
     rows.push(...FLY_KEYS.map(([key, meaning]) => row(key, meaning)));

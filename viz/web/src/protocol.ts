@@ -68,7 +68,7 @@ export interface ModelStatus {
   /** Whether the page can draw the model itself; missing on older servers. */
   has_chunks: boolean;
   /** Number of edits that can be undone; missing on older servers. */
-  edits?: number;
+  edits: number;
   psnr: number | null;
   psnr_history: [number, number][];
 }
