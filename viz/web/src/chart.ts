@@ -63,7 +63,7 @@ export class Chart {
       context.fillText(String(tick), MARGIN.left - 6, y(tick));
     }
     context.textBaseline = "alphabetic";
-    for (const tick of ticks(0, xMax, 4)) {
+    for (const tick of timeTicks(xMax)) {
       context.textAlign = x(tick) > width - 24 ? "right" : tick === 0 ? "left" : "center";
       context.fillText(timeText(tick), x(tick), height - 4);
     }
@@ -140,6 +140,12 @@ function ticks(min: number, max: number, n: number): number[] {
   const found = [];
   for (let ix = Math.ceil(min / size); ix * size <= max; ix += 1) found.push(Number((ix * size).toPrecision(6)));
   return found;
+}
+
+/** Times on the axis of a chart. Whole minutes have short labels. */
+function timeTicks(max: number): number[] {
+  if (max < 150) return ticks(0, max, 4);
+  return ticks(0, max / 60, 4).filter(Number.isInteger).map((minutes) => 60 * minutes);
 }
 
 /** Duration as readable text. */
