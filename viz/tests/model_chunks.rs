@@ -136,16 +136,23 @@ fn chunks_near_the_requested_view_come_first() {
         "projection": {"kind": "pinhole", "vertical_fov_rad": 3.1},
     }));
     subscribe(&mut client, "splat");
-    let mut distances: [Vec<f64>; 2] = Default::default();
+    // Ids in the order of their arrival, coarse and in full, and distances of the chunks in full.
+    let mut ids: [Vec<u64>; 2] = Default::default();
+    let mut distances = BTreeMap::new();
     let mut n_incomplete = None;
     while n_incomplete != Some(0) {
         let Received::Binary(header, _) = client.receive() else { continue };
         if header["type"] == "model_chunk" {
             n_incomplete = header["n_incomplete"].as_u64();
-            distances[usize::from(header["is_coarse"] == false)].push(distance(&header, eye));
+            let (id, is_fine) = (header["id"].as_u64().expect("an id"), header["is_coarse"] == false);
+            ids[usize::from(is_fine)].push(id);
+            if is_fine {
+                distances.insert(id, distance(&header, eye));
+            }
         }
     }
-    for distances in &distances {
+    for ids in &ids {
+        let distances: Vec<_> = ids.iter().map(|id| distances[id]).collect();
         assert!(distances.len() > 3, "{distances:?}");
         assert!(distances.is_sorted(), "{distances:?}");
     }

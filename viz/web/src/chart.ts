@@ -1,5 +1,7 @@
 // Accuracy of all models over time on a canvas; the selected model is highlighted.
 
+/** Least distance of the labels of times. */
+const MIN_TICK_PX = 50;
 const MARGIN = { left: 30, right: 8, top: 8, bottom: 18 };
 const MIN_SPAN_DB = 2;
 
@@ -63,7 +65,7 @@ export class Chart {
       context.fillText(String(tick), MARGIN.left - 6, y(tick));
     }
     context.textBaseline = "alphabetic";
-    for (const tick of ticks(0, xMax, 4)) {
+    for (const tick of timeTicks(xMax, Math.floor((width - MARGIN.left - MARGIN.right) / MIN_TICK_PX))) {
       context.textAlign = x(tick) > width - 24 ? "right" : tick === 0 ? "left" : "center";
       context.fillText(timeText(tick), x(tick), height - 4);
     }
@@ -140,6 +142,12 @@ function ticks(min: number, max: number, n: number): number[] {
   const found = [];
   for (let ix = Math.ceil(min / size); ix * size <= max; ix += 1) found.push(Number((ix * size).toPrecision(6)));
   return found;
+}
+
+/** Times on the axis of a chart. Whole minutes have short labels. */
+function timeTicks(max: number, n: number): number[] {
+  if (max < 150) return ticks(0, max, n);
+  return ticks(0, max / 60, n).filter(Number.isInteger).map((minutes) => 60 * minutes);
 }
 
 /** Duration as readable text. */
