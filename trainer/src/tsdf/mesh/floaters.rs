@@ -34,7 +34,8 @@ pub(in crate::tsdf) fn floaters(mesh: &Mesh, voxel_m: f64) -> Option<Floaters> {
         cells.contains((sum / 3.0).into())
     };
     let n_erased = mesh.triangles.iter().filter(is_erased).count() as u64;
-    Some(Floaters { cells, n_erased, item: "triangle" })
+    // Small parts right next to large ones share their cells.
+    (n_erased > 0).then_some(Floaters { cells, n_erased, item: "triangle" })
 }
 
 /// For each vertex, the number of triangles of its connected part.
