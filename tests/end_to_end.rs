@@ -382,7 +382,7 @@ fn receive_observations(socket: &mut tungstenite::WebSocket<std::net::TcpStream>
             break header;
         }
     };
-    assert!(header["n_views"].as_u64().is_some_and(|n| n >= 2) && header["newest_millis"].is_number(), "{header}");
+    assert!(header["n_keyframes"].as_u64().is_some_and(|n| n >= 2) && header["newest_millis"].is_number(), "{header}");
 }
 
 /// Receives all chunks of a model in training.

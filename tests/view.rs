@@ -156,7 +156,7 @@ fn check_observations(client: &mut Client) {
     client.socket.send(Message::text(message.to_string())).expect("sent");
     let (header, payload) = loop {
         let (header, payload) = client.receive();
-        if header["type"] == "observations" && header["n_views"] == 10 {
+        if header["type"] == "observations" && header["n_keyframes"] == 10 {
             break (header, payload);
         }
     };

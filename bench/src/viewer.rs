@@ -89,6 +89,8 @@ impl Viewer {
     pub fn connect(address: SocketAddr, options: ViewerOptions) -> Result<Self> {
         let stream = TcpStream::connect(address).with_context(|| format!("cannot connect to {address}"))?;
         stream.set_read_timeout(Some(MAX_SILENCE)).context("cannot set a timeout")?;
+        // As in browsers: otherwise, a request after a report would wait up to 40 ms for an acknowledgment.
+        stream.set_nodelay(true).context("cannot set an option of a connection")?;
         let pictures = Arc::default();
         let mut client = Client {
             reader: BufReader::new(stream.try_clone().context("cannot share a connection")?),

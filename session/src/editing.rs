@@ -20,7 +20,7 @@ pub(crate) fn apply(action: &EditAction, edits: &mut Arc<Edits>, method: &mut dy
         }
         EditAction::Undo => {
             changed.undo()?;
-            "the last edit was undone".to_owned()
+            "undid the last edit".to_owned()
         }
     };
     *edits = Arc::new(changed);

@@ -173,7 +173,7 @@ impl Canvas {
         self.draw_with(view, &options)
     }
 
-    /// The pixels at which MuJoCo's segmentation shows the robot; as if there was nothing else if `is_alone`.
+    /// The pixels at which MuJoCo's segmentation shows the robot; with nothing else in the scene if `is_alone`.
     pub(crate) fn robot_mask(&mut self, view: &View, is_alone: bool) -> Vec<bool> {
         let mut options = MjvOption::default();
         if is_alone {

@@ -43,7 +43,7 @@ impl RobotMasks {
         Ok(Self { canvas, _context: context })
     }
 
-    /// The pixels at which MuJoCo's segmentation shows the robot, row by row; as if there was nothing else if `is_alone`.
+    /// The pixels at which MuJoCo's segmentation shows the robot, row by row; with nothing else in the scene if `is_alone`.
     ///
     /// * `joints_rad`: positions of the arm's joints from base to flange.
     ///

@@ -31,7 +31,7 @@ pub struct ObservationMap {
     /// The observed cells.
     pub observed: Vec<ObservedCell>,
     /// Number of views.
-    pub n_views: usize,
+    pub n_keyframes: usize,
     /// When the newest view was captured; `None` if that was not in this process.
     pub newest_at: Option<Instant>,
 }
@@ -54,7 +54,7 @@ pub(crate) struct PackedObservations {
     min_m: [f64; 3],
     cell_m: f64,
     n_cells: [u32; 3],
-    n_views: usize,
+    n_keyframes: usize,
     newest_at: Option<Instant>,
     payload: Vec<u8>,
 }
@@ -75,7 +75,7 @@ impl PackedObservations {
             min_m: map.min_m,
             cell_m: map.cell_m,
             n_cells: map.n_cells,
-            n_views: map.n_views,
+            n_keyframes: map.n_keyframes,
             newest_at: map.newest_at,
             payload: encoder.finish()?,
         })
@@ -87,7 +87,7 @@ impl PackedObservations {
             min_m: self.min_m,
             cell_m: self.cell_m,
             n_cells: self.n_cells,
-            n_views: self.n_views,
+            n_keyframes: self.n_keyframes,
             newest_millis: self.newest_at.map(|at| clock.millis(at)),
             min_age_secs: MIN_AGE_SECS,
             min_sigma_m: MIN_SIGMA_M,

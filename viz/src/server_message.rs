@@ -150,7 +150,7 @@ pub(crate) struct ObservationsHeader {
     pub(crate) min_m: [f64; 3],
     pub(crate) cell_m: f64,
     pub(crate) n_cells: [u32; 3],
-    pub(crate) n_views: usize,
+    pub(crate) n_keyframes: usize,
     pub(crate) newest_millis: Option<f64>,
     pub(crate) min_age_secs: f64,
     pub(crate) min_sigma_m: f64,

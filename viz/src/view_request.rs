@@ -44,7 +44,7 @@ pub(crate) enum InvalidRequest {
     Pinhole,
     #[error("{field} needs finite corners with min_m below max_m on every axis")]
     Corners { field: &'static str },
-    #[error("the action erase needs box, and the other actions have none")]
+    #[error("box is required for the action erase and not allowed for other actions")]
     EditBox,
     #[error("{max} edits are waiting, which is the maximum; wait until they are applied")]
     Edits { max: usize },
@@ -56,7 +56,7 @@ pub(crate) enum InvalidRequest {
     ViewName { got: usize },
     #[error("{max} views have pending requests, which is the maximum; wait for a picture of one of them")]
     Views { max: usize },
-    #[error("shown_millis is {got}, expected a time of the server's clock, 0 or more")]
+    #[error("shown_millis is {got}, expected a time on the server's clock, 0 or more")]
     ShownTime { got: f64 },
     #[error("rate_hz is {got}, expected 0 to {max}", max = crate::protocol::MAX_RATE_HZ)]
     Rate { got: f64 },

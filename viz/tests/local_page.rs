@@ -80,7 +80,7 @@ fn check_tint(browser: &mut Browser, hub: &Hub, name: &str) {
         cell_m: 10.0,
         n_cells: [2; 3],
         observed: (0..8).map(|ix| cell(ix, if ix % 2 == 0 { 0.0 } else { 1e6 })).collect(),
-        n_views: 2,
+        n_keyframes: 2,
         newest_at: None,
     });
     let scratch = PathBuf::from(env!("CARGO_TARGET_TMPDIR"));

@@ -463,7 +463,7 @@ fn observation_map() -> ObservationMap {
         cell_m: 0.5,
         n_cells: [1, 2, 1],
         observed: vec![ObservedCell { ix: 1, age_secs: 1.0, sigma_m: 0.002 }],
-        n_views: 3,
+        n_keyframes: 3,
         newest_at: Some(Instant::now()),
         ..ObservationMap::default()
     }

@@ -33,16 +33,16 @@ const DEPTH_SIGMA_AT_1_M: f64 = 0.002;
 /// Positions with a larger deviation count as not determined, meters.
 const MAX_SIGMA_M: f64 = 10.0;
 
-/// What a camera has seen.
+/// Depth and pose of one keyframe.
 #[derive(Clone, Debug)]
 pub(crate) struct ObservedView {
     /// Stamp of the image.
     pub(crate) stamp: Stamp,
     /// Depth and pose, of a depth camera or rendered.
     pub(crate) depth: DepthMap,
-    /// Angle of a pixel of the image, radians.
+    /// Angle that a pixel of the image subtends, radians.
     pub(crate) pixel_rad: f64,
-    /// Whether the depth was measured. If not, it only tells which surface was seen.
+    /// Whether the depth was measured. If not, it only determines which surface is visible.
     pub(crate) is_measured: bool,
 }
 
@@ -86,7 +86,7 @@ pub(crate) fn map_of(views: &[ObservedView]) -> Option<ObservationMap> {
         cell_m: grid.cell_m,
         n_cells: grid.n_cells,
         observed,
-        n_views: views.len(),
+        n_keyframes: views.len(),
         newest_at: None,
     })
 }

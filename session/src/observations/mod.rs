@@ -31,7 +31,7 @@ const NOTICEABLE_RAD: f64 = 1e-3;
 /// Camera and stamp of a keyframe.
 type Key = (Arc<str>, Stamp);
 
-/// A camera that has seen the scene.
+/// A keyframe whose camera has observed the scene.
 #[derive(Clone, Debug)]
 pub(crate) struct SeenFrom {
     /// Pose and intrinsics, with corrections.

@@ -1,6 +1,6 @@
 // Accuracy of all models over time on a canvas; the selected model is highlighted.
 
-/** Least distance of the labels of times. */
+/** Minimum distance between time labels. */
 const MIN_TICK_PX = 50;
 const MARGIN = { left: 30, right: 8, top: 8, bottom: 18 };
 const MIN_SPAN_DB = 2;

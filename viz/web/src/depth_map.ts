@@ -3,7 +3,7 @@
 import { type Matrix4, Vector3 } from "three";
 import { type PosedDepth, depthAt } from "./surface_picker";
 
-/** Free space around a point, as far as it is known. */
+/** Free space around a point, where known. */
 export interface DepthMap {
   /** The point from which the surfaces were seen. */
   readonly origin: Vector3;

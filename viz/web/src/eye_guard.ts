@@ -14,7 +14,7 @@ const STEP_MARGINS = 0.25;
 const MAX_STEPS = 800;
 /** A step to a greater depth behind a surface, in margins, passed its edge instead of the surface. */
 const MAX_DEPTH_MARGINS = 4;
-/** The eye is inside of something if most of what it sees is closer than this, in margins. */
+/** The eye is inside an object if most of what it sees is closer than this, in margins. */
 const INSIDE_MARGINS = 2;
 const MAX_TRAIL = 2000;
 

@@ -32,8 +32,8 @@ let showsModel = true;
 let liveCamera: LiveImageHeader | null = null;
 /** Buttons that tint the model, their keys, and what the tint shows. */
 const TINTS: readonly { id: string; key: string; quantity: Quantity }[] = [
-  { id: "toggle-age", key: "a", quantity: "age" },
-  { id: "toggle-uncertainty", key: "y", quantity: "uncertainty" },
+  { id: "toggle-age", key: "1", quantity: "age" },
+  { id: "toggle-uncertainty", key: "2", quantity: "uncertainty" },
 ];
 
 const readouts = new Readouts();
@@ -47,7 +47,7 @@ keepToken();
 window.addEventListener("hashchange", () => {
   if (keepToken()) location.reload(); // The server assigns the role when the page connects.
 });
-// A page that becomes visible subscribes anew, and gets all chunks again.
+// A page that becomes visible subscribes again, and receives all chunks again.
 document.addEventListener("visibilitychange", () => {
   if (!document.hidden) view.local.clear();
 });
@@ -198,7 +198,7 @@ function receiveBinary(header: BinaryHeader, payload: Uint8Array<ArrayBuffer>): 
     element("toggle-scans").hidden = false;
     view.changed();
   } else if (header.type === "observations") {
-    view.observations.receive(header, payload).catch((error: unknown) => console.error("cannot show ages:", error));
+    view.observations.receive(header, payload).catch((error: unknown) => console.error("cannot show the map of observations:", error));
   } else if (header.type === "model_chunk") {
     view.local.receive(header, payload);
     showLocalProgress();
@@ -255,7 +255,9 @@ function action(id: string, key: string, act: () => void): void {
   element(id).addEventListener("click", act);
   window.addEventListener("keydown", (event) => {
     const isPlain = !event.ctrlKey && !event.metaKey && !event.altKey && !event.repeat;
-    if (event.target instanceof HTMLInputElement || event.target instanceof HTMLSelectElement) return;
+    if (element(id).hidden || event.target instanceof HTMLInputElement || event.target instanceof HTMLSelectElement) {
+      return;
+    }
     if (isPlain && event.key.toLowerCase() === key) act();
   });
 }

@@ -19,8 +19,8 @@ const LABELS: Record<Quantity, string[]> = {
   uncertainty: ["up to 0.01 mm", "0.1 mm", "1 mm", "1 cm", "10 cm or more"],
 };
 const TITLES: Record<Quantity, string> = {
-  age: "Time since the last keyframe of each place",
-  uncertainty: "Standard deviation of the position, from the views",
+  age: "Time since each place was last in a keyframe",
+  uncertainty: "Standard deviation of the position, from the keyframes",
 };
 /** A shader's loop-free color scale. */
 const SCALE = COLORS.map((color) => new THREE.Vector3().setFromColor(new THREE.Color(color)));
@@ -129,7 +129,7 @@ export class ObservationLayer {
       uniforms.observationAge.value = Math.max(0, (age ?? 0) / 1000);
       const isSaved = quantity === "age" && this.newestMillis === null;
       element("legend-title").textContent = this.hasMap
-        ? TITLES[quantity] + (isSaved ? ", at the last one" : "")
+        ? TITLES[quantity] + (isSaved ? ", relative to the newest keyframe" : "")
         : "waiting for the map of observations";
       element("legend-labels").replaceChildren(...LABELS[quantity].map(label));
     }

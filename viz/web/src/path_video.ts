@@ -87,6 +87,6 @@ export class PathVideo {
 }
 
 function bitmapOf({ header: { color }, payload }: SidePicture): Promise<ImageBitmap> {
-  if (!color) throw new Error("a picture without colors arrived");
+  if (!color) throw new Error("received a picture without color");
   return createImageBitmap(new Blob([payload.subarray(color.offset, color.offset + color.bytes)], { type: "image/jpeg" }));
 }

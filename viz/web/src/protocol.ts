@@ -342,7 +342,7 @@ export interface ObservationsHeader {
   min_m: [number, number, number];
   cell_m: number;
   n_cells: [number, number, number];
-  n_views: number;
+  n_keyframes: number;
   newest_millis: number | null;
   min_age_secs: number;
   min_sigma_m: number;

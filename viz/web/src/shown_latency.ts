@@ -8,7 +8,7 @@ import type { Connection } from "./connection";
 import { element } from "./element";
 import type { PictureHeader } from "./protocol";
 
-/** Duration of the statistics. */
+/** Time window of the statistics. */
 const WINDOW_MILLIS = 60_000;
 /** Minimum time between two reports to the server. */
 const REPORT_MILLIS = 100;
