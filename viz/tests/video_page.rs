@@ -149,11 +149,11 @@ fn a_recorded_video_has_every_frame() {
     wait_for(&mut browser, "the end", |browser| browser.text("path-video") == "Video");
     assert_eq!(browser.text("path-count"), "2 views");
     assert_eq!(browser.evaluate("window.file"), json!(null));
-    assert_eq!(browser.text("notice"), "");
+    assert_eq!(browser.text("path-note"), "");
     browser
         .evaluate("delete window.VideoEncoder; Object.defineProperty(window, 'isSecureContext', { value: false }); 0");
     browser.click("path-video");
-    assert!(browser.text("notice").contains("start fieldrig with --share"), "{}", browser.text("notice"));
+    assert!(browser.text("path-note").contains("start fieldrig with --share"), "{}", browser.text("path-note"));
     drop(browser);
     drop(renderer);
     std::fs::remove_dir_all(&profile).expect("the browser has left its profile");

@@ -1,7 +1,7 @@
 // Depth of the model as seen from a point, in one picture or in all directions.
 
 import { type Matrix4, Vector3 } from "three";
-import { type PosedDepth, depthAt } from "./surface_picker";
+import { type PosedDepth, pixelAt } from "./surface_picker";
 
 /** Free space around a point, where known. */
 export interface DepthMap {
@@ -11,6 +11,8 @@ export interface DepthMap {
   readonly isComplete: boolean;
   /** How far a point lies in front of the surface in its direction, meters: negative behind it, infinite if there is none. */
   clearance(point: Vector3): number;
+  /** The largest clearance within the resolution of the map: negative only if the point is certainly behind a surface. */
+  largestClearance(point: Vector3): number;
   /** Whether most surfaces around the origin are closer than this. */
   isWithin(distanceM: number): boolean;
 }
@@ -27,9 +29,17 @@ export class PictureDepthMap implements DepthMap {
   }
 
   clearance(point: Vector3): number {
+    return this.behind(point, 0);
+  }
+
+  largestClearance(point: Vector3): number {
+    return this.behind(point, 1);
+  }
+
+  private behind(point: Vector3, reach: number): number {
     const inPicture = point.clone().applyMatrix4(this.pictureFromWorld);
-    const surface = depthAt(this.posed, inPicture);
-    return surface > 0 ? surface - inPicture.z : Infinity;
+    const pixel = pixelAt(this.posed, inPicture);
+    return pixel ? surface(this.posed.depth, this.posed.depthSizePx, pixel, reach) - inPicture.z : Infinity;
   }
 
   isWithin(): boolean {
@@ -53,14 +63,21 @@ export class PanoramaDepthMap implements DepthMap {
   }
 
   clearance(point: Vector3): number {
+    return this.behind(point, 0);
+  }
+
+  largestClearance(point: Vector3): number {
+    return this.behind(point, 1);
+  }
+
+  private behind(point: Vector3, reach: number): number {
     const { x, y, z } = point.clone().applyMatrix4(this.pictureFromWorld);
     const distance = Math.hypot(x, y, z);
     if (distance === 0) return Infinity;
     const [width, height] = this.sizePx;
     const column = Math.min(width - 1, Math.floor((0.5 + Math.atan2(x, z) / (2 * Math.PI)) * width));
     const row = Math.min(height - 1, Math.floor((0.5 + Math.asin(y / distance) / Math.PI) * height));
-    const surface = this.depth[row * width + column] ?? 0;
-    return surface > 0 ? surface - distance : Infinity;
+    return surface(this.depth, this.sizePx, [column, row], reach) - distance;
   }
 
   isWithin(distanceM: number): boolean {
@@ -74,4 +91,15 @@ export class PanoramaDepthMap implements DepthMap {
     });
     return near > 0.5 * all;
   }
+}
+
+/** Largest depth of a pixel and of its neighbors at this distance; infinite without a surface. */
+function surface(depth: Float32Array, [width, height]: [number, number], [x, y]: [number, number], reach: number): number {
+  let largest = 0;
+  for (let row = Math.max(0, y - reach); row <= Math.min(height - 1, y + reach); row++) {
+    for (let column = Math.max(0, x - reach); column <= Math.min(width - 1, x + reach); column++) {
+      largest = Math.max(largest, depth[row * width + column] || Infinity);
+    }
+  }
+  return largest;
 }

@@ -2,7 +2,8 @@
 //
 // A motion ends before a surface that is known from a picture or from the mesh. A surface that was not known during the
 // motion appears in a later picture, between the new eye and the places where it was before: the eye then returns.
-// What a surface hides is unknown space, which the eye may enter around the edges of the surface.
+// What a surface hides is unknown space. If the surroundings of the eye are known, it waits at the edge of that space for
+// newer ones.
 
 import { Vector3 } from "three";
 import type { DepthMap } from "./depth_map";
@@ -14,8 +15,8 @@ const STEP_MARGINS = 0.25;
 const MAX_STEPS = 800;
 /** A step to a greater depth behind a surface, in margins, passed its edge instead of the surface. */
 const MAX_DEPTH_MARGINS = 4;
-/** The eye is inside an object if most of what it sees is closer than this, in margins. */
-const INSIDE_MARGINS = 2;
+/** The eye is inside an object if most of what it sees is closer than this, in margins. Corners are not as close. */
+const INSIDE_MARGINS = 0.7;
 const MAX_TRAIL = 2000;
 
 /** The eye keeps these points, in margins around it, in front of surfaces. */
@@ -50,6 +51,7 @@ export class EyeGuard {
   jump(stand: Stand, isGood: boolean): void {
     this.trail = [copy(stand)];
     this.hasGood = isGood;
+    if (!isGood) this.maps.clear(); // They show other surroundings.
   }
 
   /** Forgets what is known about the model. */
@@ -104,16 +106,29 @@ export class EyeGuard {
     const hit = this.hitMesh(from, direction, length + margin);
     const n = Math.min(MAX_STEPS, Math.ceil(length / (STEP_MARGINS * margin)));
     const maps = [...this.maps.values()].map((map) => ({ map, least: Math.min(0, this.clearanceOfBall(map, from)) }));
+    const complete = [...this.maps.values()].find((map) => map.isComplete);
+    const wasKnown = this.isKnown(from);
     let eye = from.clone();
     for (let step = 1; step <= n; step++) {
       const next = from.clone().addScaledVector(motion, step / n);
       if (hit && (length * step) / n > hit.distance - margin) return { eye, normal: hit.normal };
+      // Out of unknown space, there is a way back to where the surroundings were seen from.
+      const isBack = !wasKnown && complete && next.distanceTo(complete.origin) < eye.distanceTo(complete.origin);
+      if (complete && !isBack && !this.isKnown(next)) return { eye, normal: null };
       for (const { map, least } of maps) {
         if (this.clearanceOfBall(map, next) < least) return { eye, normal: this.normal(map, eye) };
       }
       eye = next;
     }
     return { eye: n > 0 ? to : from, normal: null };
+  }
+
+  /** Whether a point is visible from the origin of a map in all directions, or in front of a surface in a picture. */
+  private isKnown(point: Vector3): boolean {
+    return [...this.maps.values()].some((map) => {
+      const clearance = map.clearance(point);
+      return clearance > 0 && (map.isComplete || clearance < Infinity);
+    });
   }
 
   /** Least clearance of points around the eye; those that are hidden are left out. */
@@ -140,7 +155,7 @@ export class EyeGuard {
       const next = way[ix + 1]?.eye;
       if (!next) return false;
       const n = Math.min(MAX_STEPS, Math.ceil(eye.distanceTo(next) / (STEP_MARGINS * margin)));
-      return Array.from({ length: n }, (_, step) => map.clearance(eye.clone().lerp(next, (step + 1) / n))).some(
+      return Array.from({ length: n }, (_, step) => map.largestClearance(eye.clone().lerp(next, (step + 1) / n))).some(
         (clearance) => clearance < -margin && clearance > -MAX_DEPTH_MARGINS * margin,
       );
     });

@@ -104,6 +104,7 @@ const surroundings = new Surroundings(
   sides[0],
   (shown) => scheduler.picture(shown),
   (map) => view.see("surroundings", map),
+  () => view.forgetSurfaces(),
 );
 const settings = new ViewSettings(view, scheduler, sides[1]);
 

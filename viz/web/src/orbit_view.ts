@@ -217,9 +217,13 @@ export class OrbitView {
 
   /** Called after each motion by the user: stops before surfaces. */
   private moved(): void {
-    if (this.isPlacing || this.returning) return;
+    if (this.isPlacing) return;
     const { position } = this.camera;
     const { target } = this.controls;
+    if (this.returning) {
+      this.place(this.copyOfStand());
+      return;
+    }
     if (position.equals(this.stand.eye) && target.equals(this.stand.target)) return;
     const isShifted = !target.equals(this.stand.target);
     const allowed = this.isModelShown ? this.guard.limit(position, isShifted) : position;

@@ -44,13 +44,18 @@ export function surfacePoint(ray: Ray, posed: PosedDepth, nearM: number, farM: n
 }
 
 /** Depth of the pixel onto which a point projects; 0 if there is none. */
-export function depthAt(posed: PosedDepth, inPicture: Vector3): number {
-  if (inPicture.z <= 0) return 0;
+function depthAt(posed: PosedDepth, inPicture: Vector3): number {
+  const pixel = pixelAt(posed, inPicture);
+  return pixel ? (posed.depth[pixel[1] * posed.depthSizePx[0] + pixel[0]] ?? 0) : 0;
+}
+
+/** The pixel of the depth map onto which a point projects; null if it lies outside. */
+export function pixelAt(posed: PosedDepth, inPicture: Vector3): [number, number] | null {
+  if (inPicture.z <= 0) return null;
   const uv = [inPicture.x, inPicture.y].map(
     (value, axis) =>
       ((posed.focalPx[axis]! * value) / inPicture.z + posed.principalPx[axis]!) / posed.sizePx[axis]!,
   );
-  if (uv.some((value) => value < 0 || value >= 1)) return 0;
-  const [x, y] = uv.map((value, axis) => Math.floor(value * posed.depthSizePx[axis]!)) as [number, number];
-  return posed.depth[y * posed.depthSizePx[0] + x] ?? 0;
+  if (uv.some((value) => value < 0 || value >= 1)) return null;
+  return uv.map((value, axis) => Math.floor(value * posed.depthSizePx[axis]!)) as [number, number];
 }

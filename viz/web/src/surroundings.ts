@@ -11,25 +11,26 @@ const SIZE_PX: [number, number] = [192, 96];
 /** Pause between two requests, and the fraction of the time that may be spent on them. */
 const PAUSE_MILLIS = 150;
 const SHARE = 0.25;
+/** An answer that is later than this is not waited for. */
+const TIMEOUT_MILLIS = 30_000;
 
 export class Surroundings {
   private requestedFor = "";
+  private requestedAt = 0;
   private dueAt = 0;
 
   constructor(
     private readonly side: SideView,
     private readonly picture: (view: View) => Omit<PictureRequest, "outputs">,
     private readonly adopt: (map: PanoramaDepthMap) => void,
+    private readonly fail: () => void,
   ) {}
-
-  /** Requests the surroundings again at the next opportunity. */
-  forget(): void {
-    this.requestedFor = "";
-  }
 
   /** Called for every display refresh. */
   tick(view: View, method: string | undefined): void {
-    if (this.side.isWaiting || performance.now() < this.dueAt || !this.side.isPossible) return;
+    const now = performance.now();
+    if (this.side.isWaiting && now - this.requestedAt > TIMEOUT_MILLIS) this.side.abandon("no answer");
+    if (this.side.isWaiting || now < this.dueAt || !this.side.isPossible) return;
     const { world_from_camera: pose, crop } = view;
     const key = JSON.stringify([pose[3], pose[7], pose[11], crop, method]);
     if (key === this.requestedFor) return;
@@ -38,7 +39,7 @@ export class Surroundings {
   }
 
   private async request(view: View): Promise<void> {
-    const began = performance.now();
+    this.requestedAt = performance.now();
     try {
       const { header, payload } = await this.side.request({
         ...this.picture(view),
@@ -50,8 +51,8 @@ export class Surroundings {
       const { depth, sizePx } = await decodeDepth(header.depth, payload);
       this.adopt(new PanoramaDepthMap(worldFromCamera(header.world_from_camera), depth, sizePx));
     } catch {
-      // The pictures of the main view still show surfaces.
+      this.fail(); // The pictures of the main view still show surfaces.
     }
-    this.dueAt = performance.now() + Math.max(PAUSE_MILLIS, (performance.now() - began) * (1 / SHARE - 1));
+    this.dueAt = performance.now() + Math.max(PAUSE_MILLIS, (performance.now() - this.requestedAt) * (1 / SHARE - 1));
   }
 }

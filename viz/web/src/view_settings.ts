@@ -86,9 +86,9 @@ export class ViewSettings {
   }
 
   private async record(): Promise<void> {
-    const [notice, count] = [element("notice"), element("path-count")];
+    const [note, count] = [element("path-note"), element("path-count")];
     const reason = whyNoVideo();
-    notice.textContent = reason ?? "";
+    note.textContent = reason ?? "";
     if (reason) return;
     const frames = this.path.frames();
     try {
@@ -99,7 +99,7 @@ export class ViewSettings {
       const file = await recording;
       if (file) download(file, "camera_path.mp4");
     } catch (error) {
-      notice.textContent = `Cannot record a video: ${error instanceof Error ? error.message : String(error)}`;
+      note.textContent = `Cannot record a video: ${error instanceof Error ? error.message : String(error)}`;
     }
     this.edit(() => undefined);
   }
