@@ -230,6 +230,7 @@ fn page_renders_scene_and_overlays_correctly() {
     check_distance(&mut browser, &full);
     check_images(&mut browser);
     check_settings(&mut browser, &render_thread, &full);
+    check_refresh(&mut browser, &render_thread, &hub);
     check_camera_path(&mut browser, &full);
     check_reconnect(&mut browser, server, &hub);
 
@@ -386,6 +387,30 @@ fn check_settings(browser: &mut Browser, render_thread: &RenderThread, before: &
     set(browser, "opacity", "100");
     browser.click("toggle-grid");
     browser.click("toggle-settings");
+}
+
+/// While the model changes, the view at rest is refreshed: with pauses, or continuously.
+fn check_refresh(browser: &mut Browser, render_thread: &RenderThread, hub: &Hub) {
+    const CHANGES: Duration = Duration::from_secs(3);
+    let mut step = 2000;
+    let [n_with_pauses, n_continuous] = ["pauses", "continuous"].map(|refresh| {
+        set(browser, "refresh", refresh);
+        let (n_before, began) = (render_thread.requests().len(), Instant::now());
+        while began.elapsed() < CHANGES {
+            step += 1;
+            hub.set_status(Status {
+                state: "training".to_owned(),
+                model: ModelStatus { method: "splat".to_owned(), step, ..ModelStatus::default() },
+                ..Status::default()
+            });
+            std::thread::sleep(Duration::from_millis(50));
+        }
+        render_thread.requests().len() - n_before
+    });
+    set(browser, "refresh", "pauses");
+    assert!(n_with_pauses >= 2, "{n_with_pauses} pictures");
+    assert!(n_continuous > 2 * n_with_pauses, "{n_continuous} pictures, with pauses {n_with_pauses}");
+    publish_updates(hub);
 }
 
 /// A camera path begins and ends at the added views, in the axes of nerfstudio.

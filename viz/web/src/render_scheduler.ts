@@ -19,11 +19,14 @@ export interface View {
 }
 
 const REST_MILLIS = 180;
-const REFRESH_MILLIS = 700;
-/** Maximum fraction of the time spent on refreshes. */
+/** Minimum pause between two refreshes. */
+const REFRESH_MILLIS = 150;
+/** Maximum fraction of the time spent on refreshes, and thus of the bandwidth. */
 const REFRESH_SHARE = 0.25;
 /** The same if the page draws the model itself and needs only the depth. */
 const LOCAL_REFRESH_MILLIS = 3000;
+/** The model counts as changing for so long after a change: the status, which reports changes, arrives twice a second. */
+const CHANGING_MILLIS = 1200;
 /** While moving, pictures that take longer than this are requested smaller, and pictures that take less than a third of it larger. */
 const MOVING_MILLIS = 110;
 const MOVING_SCALES = [0.1, 0.15, 0.25, 0.35, 0.5, 0.7, 1];
@@ -42,7 +45,8 @@ export class RenderScheduler {
   private isWaiting = false;
   private isResting = false;
   private hasUpdate = false;
-  /** Whether every change of the model is requested as soon as the previous picture has arrived. */
+  private changedAt = -Infinity;
+  /** Whether the next picture is requested as soon as the previous one has arrived, while the model changes. */
   isContinuous = false;
   /** Whether the page draws the model itself. Then, only the depth of the resting view is requested. */
   private isLocal = false;
@@ -73,6 +77,7 @@ export class RenderScheduler {
   /** Called when the model has changed. */
   modelChanged(): void {
     this.hasUpdate = true;
+    this.changedAt = performance.now();
   }
 
   /** Discards pending requests, which will not be answered. */
@@ -113,11 +118,16 @@ export class RenderScheduler {
       this.request(finer.length > 0 ? finer : [1]); // Replaces any pending request.
     } else if (!this.isResting && !this.isWaiting && !this.isLocal) {
       this.request([MOVING_SCALES[this.movingIx]!]);
-    } else if (this.isResting && !this.isWaiting && this.hasUpdate) {
+    } else if (this.isResting && !this.isWaiting && (this.hasUpdate || this.isChanging(now))) {
       const period = this.isLocal ? LOCAL_REFRESH_MILLIS : REFRESH_MILLIS;
       const pause = this.isContinuous ? 0 : Math.max(period, this.lastMillis * (1 / REFRESH_SHARE - 1));
       if (now - this.finishedAt > pause) this.request([1]);
     }
+  }
+
+  /** Whether the model is probably changing. Depth alone is only requested after known changes. */
+  private isChanging(now: number): boolean {
+    return !this.isLocal && now - this.changedAt < CHANGING_MILLIS;
   }
 
   private request(stages: number[]): void {
