@@ -2,7 +2,7 @@
 
 use crate::chunk_publisher::ChunkPublisher;
 use crate::ledger::{KeyframeTimes, Ledger};
-use crate::observations::{ObservationPublisher, SeenFrom};
+use crate::observations::{ModelState, ObservationPublisher, PosedKeyframe};
 use crate::recoveries::{self, OpenGpu, Recoveries};
 use crate::render_budget::RenderBudget;
 use crate::session::Session;
@@ -521,15 +521,20 @@ impl Live {
             return;
         }
         let session = &mut self.sessions[0];
-        let seen_from = |keyframe: &Arc<Keyframe>| SeenFrom {
+        let posed = |keyframe: &Arc<Keyframe>| PosedKeyframe {
             pose: frustum(keyframe, &session.camera_of(keyframe)),
             keyframe: Some(Arc::clone(keyframe)),
         };
-        let views: Vec<SeenFrom> = self.keyframes.iter().map(seen_from).collect();
-        let newest = self.ledger.keyframes().last().map(|times| times.input.captured.unwrap_or(times.input.arrived));
-        let step = session.progress().step;
+        let keyframes: Vec<PosedKeyframe> = self.keyframes.iter().map(posed).collect();
+        let captured_at = |pose: &KeyframePose| {
+            let mut newest_first = self.ledger.keyframes().iter().rev();
+            let times = newest_first.find(|times| times.camera == pose.camera && times.stamp == pose.stamp)?;
+            Some(times.input.captured.unwrap_or(times.input.arrived))
+        };
+        let edits = Arc::clone(session.edits());
+        let model = ModelState { step: session.progress().step, edits: &edits, captured_at: &captured_at };
         let render = |request: &RenderRequest| session.render(request);
-        let spent = self.observation_publisher.publish(&views, step, newest, render);
+        let spent = self.observation_publisher.publish(&keyframes, &model, render);
         self.budget.add_render(spent);
     }
 

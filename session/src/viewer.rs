@@ -2,7 +2,7 @@
 
 use crate::chunk_publisher::ChunkPublisher;
 use crate::editing;
-use crate::observations::{ObservationPublisher, SeenFrom};
+use crate::observations::{ModelState, ObservationPublisher, PosedKeyframe};
 use capture::Stop;
 use kinematics::Transform;
 use std::path::PathBuf;
@@ -33,7 +33,7 @@ pub struct ModelViewer {
     hub: Hub,
     chunk_publisher: ChunkPublisher,
     /// Views of the training images, in the page's world.
-    cameras: Vec<SeenFrom>,
+    cameras: Vec<PosedKeyframe>,
     observation_publisher: ObservationPublisher,
     /// Pose of the page's world, which is z up, in the model's world.
     model_from_page: Transform,
@@ -44,11 +44,11 @@ pub struct ModelViewer {
 impl ModelViewer {
     /// A viewer of models whose z axis points up. The keyframes of the hub are the views of the model's training images.
     pub fn new(models: Vec<ServedModel>, hub: Hub) -> Self {
-        let seen_from = |pose: KeyframePose| SeenFrom { pose, keyframe: None };
+        let posed = |pose: KeyframePose| PosedKeyframe { pose, keyframe: None };
         Self {
             models,
             chunk_publisher: ChunkPublisher::new(hub.clone()),
-            cameras: hub.keyframe_poses().into_iter().map(seen_from).collect(),
+            cameras: hub.keyframe_poses().into_iter().map(posed).collect(),
             observation_publisher: ObservationPublisher::new(hub.clone()),
             hub,
             model_from_page: Transform::identity(),
@@ -80,11 +80,12 @@ impl ModelViewer {
         if self.cameras.is_empty() || !self.observation_publisher.is_due() {
             return;
         }
-        let method = &mut self.models[0].method;
+        let ServedModel { method, edits, .. } = &mut self.models[0];
         let model_from_page = &self.model_from_page;
         let render = |request: &RenderRequest| method.render(&in_model(request, model_from_page));
         // The step has no effect, because the model does not change.
-        self.observation_publisher.publish(&self.cameras, 1, None, render);
+        let model = ModelState { step: 1, edits, captured_at: &|_| None };
+        self.observation_publisher.publish(&self.cameras, &model, render);
     }
 
     fn publish_chunks(&mut self) {

@@ -1,9 +1,9 @@
 //! Computes when and how precisely each part of a scene was observed.
 //!
-//! Each view contributes the information (inverse covariance) that it has about the position of the surface in a cell:
-//! across the ray, from the size of a pixel; along the ray, from the depth camera, if there is one. Two views from
+//! Each keyframe contributes the information (inverse covariance) that it has about the position of the surface in a cell:
+//! across the ray, from the size of a pixel; along the ray, from the depth camera, if there is one. Two keyframes from
 //! different directions therefore determine a position without depth, as in triangulation (Hartley and Zisserman 2004,
-//! section 12.6). Errors that views have in common, for example of the calibration, are not part of the result.
+//! section 12.6). Errors that keyframes have in common, for example of the calibration, are not part of the result.
 #![expect(
     clippy::cast_possible_truncation,
     clippy::cast_sign_loss,
@@ -35,7 +35,7 @@ const MAX_SIGMA_M: f64 = 10.0;
 
 /// Depth and pose of one keyframe.
 #[derive(Clone, Debug)]
-pub(crate) struct ObservedView {
+pub(crate) struct PosedDepth {
     /// Stamp of the image.
     pub(crate) stamp: Stamp,
     /// Depth and pose, of a depth camera or rendered.
@@ -52,8 +52,8 @@ struct Cell {
     /// Sum of the inverse covariances of its position, meters^-2.
     information: Matrix3<f64>,
     newest: Stamp,
-    /// The last view that has contributed.
-    view: usize,
+    /// Index of the last keyframe that has contributed.
+    keyframe: usize,
 }
 
 /// A grid of cubic cells, axis-aligned in world.
@@ -64,18 +64,18 @@ struct Grid {
     n_cells: [u32; 3],
 }
 
-/// The map of these views; `None` if they have seen nothing.
-pub(crate) fn map_of(views: &[ObservedView]) -> Option<ObservationMap> {
-    let newest = views.iter().map(|view| view.stamp).max()?;
-    let grid = Grid::around(views)?;
-    let mut cells: Vec<Option<Cell>> = vec![None; grid.n_cells.iter().map(|n| *n as usize).product()];
-    for (ix, view) in views.iter().enumerate() {
-        add_view(&mut cells, &grid, ix, view);
+/// The map of these keyframes; `None` if they have seen nothing.
+pub(crate) fn map_of(keyframes: &[PosedDepth]) -> Option<ObservationMap> {
+    let newest = keyframes.iter().map(|keyframe| keyframe.stamp).max()?;
+    let grid = Grid::around(keyframes)?;
+    let mut cells = SparseCells::new(&grid);
+    for (ix, keyframe) in keyframes.iter().enumerate() {
+        add_keyframe(&mut cells, &grid, ix, keyframe);
     }
-    let observed = cells.iter().enumerate().filter_map(|(ix, cell)| {
-        let cell = cell.as_ref()?;
-        let age_secs = (newest.0 - cell.newest.0) as f64 * 1e-9;
-        Some(ObservedCell { ix, age_secs, sigma_m: cell.sigma_m() })
+    let observed = cells.cells.into_iter().map(|(ix, cell)| ObservedCell {
+        ix,
+        age_secs: (newest.0 - cell.newest.0) as f64 * 1e-9,
+        sigma_m: cell.sigma_m(),
     });
     let mut observed: Vec<ObservedCell> = observed.collect();
     for _ in 0..N_EXTENSIONS {
@@ -86,27 +86,56 @@ pub(crate) fn map_of(views: &[ObservedView]) -> Option<ObservationMap> {
         cell_m: grid.cell_m,
         n_cells: grid.n_cells,
         observed,
-        n_keyframes: views.len(),
+        n_keyframes: keyframes.len(),
         newest_at: None,
     })
 }
 
-/// Adds what a view has seen. Each cell is counted once, however many rays meet it, so that its size does not matter.
-fn add_view(cells: &mut [Option<Cell>], grid: &Grid, ix: usize, view: &ObservedView) {
-    let eye = view.depth.world_from_camera.translation.vector;
-    for point in points(&view.depth) {
+/// Adds what a keyframe shows. Each cell is counted once, however many rays meet it, so that its size does not matter.
+fn add_keyframe(cells: &mut SparseCells<Cell>, grid: &Grid, ix: usize, keyframe: &PosedDepth) {
+    let camera = keyframe.depth.world_from_camera.translation.vector;
+    for point in points(&keyframe.depth) {
         let Some(cell_ix) = grid.index(&point) else { continue };
-        let cell =
-            cells[cell_ix].get_or_insert(Cell { information: Matrix3::zeros(), newest: view.stamp, view: usize::MAX });
-        if std::mem::replace(&mut cell.view, ix) == ix {
+        let cell = cells.entry(cell_ix, || Cell {
+            information: Matrix3::zeros(),
+            newest: keyframe.stamp,
+            keyframe: usize::MAX,
+        });
+        if std::mem::replace(&mut cell.keyframe, ix) == ix {
             continue;
         }
-        cell.newest = cell.newest.max(view.stamp);
-        let ray = point.coords - eye;
+        cell.newest = cell.newest.max(keyframe.stamp);
+        let ray = point.coords - camera;
         let (distance_m, direction) = (ray.norm(), ray.normalize());
-        let across = (distance_m * view.pixel_rad * SIGMA_PX).powi(-2);
-        let along = if view.is_measured { (DEPTH_SIGMA_AT_1_M * distance_m.powi(2)).powi(-2) } else { 0.0 };
+        let across = (distance_m * keyframe.pixel_rad * SIGMA_PX).powi(-2);
+        let along = if keyframe.is_measured { (DEPTH_SIGMA_AT_1_M * distance_m.powi(2)).powi(-2) } else { 0.0 };
         cell.information += across * Matrix3::identity() + (along - across) * direction * direction.transpose();
+    }
+}
+
+/// Values of some cells of a grid.
+struct SparseCells<T> {
+    /// For each cell of the grid: index in `cells`, or `NONE`.
+    slots: Vec<u32>,
+    /// Indices and values of cells.
+    cells: Vec<(usize, T)>,
+}
+
+const NONE: u32 = u32::MAX;
+
+impl<T> SparseCells<T> {
+    fn new(grid: &Grid) -> Self {
+        Self { slots: vec![NONE; grid.n_cells.iter().map(|n| *n as usize).product()], cells: Vec::new() }
+    }
+
+    /// The value of a cell, which is created if it has none.
+    fn entry(&mut self, ix: usize, create: impl FnOnce() -> T) -> &mut T {
+        let slot = &mut self.slots[ix];
+        if *slot == NONE {
+            *slot = self.cells.len() as u32;
+            self.cells.push((ix, create()));
+        }
+        &mut self.cells[*slot as usize].1
     }
 }
 
@@ -120,10 +149,11 @@ impl Cell {
 
 impl Grid {
     /// The grid that contains most of the observed points; `None` if there are none.
-    fn around(views: &[ObservedView]) -> Option<Self> {
-        let n_points: usize = views.iter().map(|view| view.depth.depth_m.len()).sum();
+    fn around(keyframes: &[PosedDepth]) -> Option<Self> {
+        let n_points: usize = keyframes.iter().map(|keyframe| keyframe.depth.depth_m.len()).sum();
         let stride = n_points.div_ceil(MAX_SAMPLES).max(1);
-        let sample: Vec<Point3<f64>> = views.iter().flat_map(|view| points(&view.depth)).step_by(stride).collect();
+        let sample: Vec<Point3<f64>> =
+            keyframes.iter().flat_map(|keyframe| points(&keyframe.depth)).step_by(stride).collect();
         let along = |axis: usize, frac: f64| {
             quantile(&mut sample.iter().map(|point| point[axis]).collect::<Vec<_>>(), frac, Rank::Upper)
         };
@@ -174,15 +204,15 @@ fn points(depth: &DepthMap) -> impl Iterator<Item = Point3<f64>> {
 /// Gives each cell the newest age and the smallest deviation of its neighbors, too. Otherwise, a surface along a boundary
 /// between cells would get alternating values, and cells between sparse rays none.
 fn extended(grid: &Grid, observed: &[ObservedCell]) -> Vec<ObservedCell> {
-    let mut merged: Vec<Option<ObservedCell>> = vec![None; grid.n_cells.iter().map(|n| *n as usize).product()];
+    let mut merged = SparseCells::new(grid);
     for cell in observed {
         for ix in grid.with_neighbors(cell.ix) {
-            let neighbor = merged[ix].get_or_insert(ObservedCell { ix, ..*cell });
+            let neighbor = merged.entry(ix, || ObservedCell { ix, ..*cell });
             neighbor.age_secs = neighbor.age_secs.min(cell.age_secs);
             neighbor.sigma_m = neighbor.sigma_m.min(cell.sigma_m);
         }
     }
-    merged.into_iter().flatten().collect()
+    merged.cells.into_iter().map(|(_, cell)| cell).collect()
 }
 
 #[cfg(test)]
@@ -195,7 +225,7 @@ mod tests {
     const FOCAL_PX: f64 = 60.0;
 
     /// A camera at `eye` that looks at the point (0, 2, 0), in front of a wall at y = 2.
-    fn view(secs: i64, eye: [f64; 3], is_measured: bool) -> ObservedView {
+    fn view(secs: i64, eye: [f64; 3], is_measured: bool) -> PosedDepth {
         let eye = Point3::from(eye);
         let forward = Point3::new(0.0, 2.0, 0.0) - eye;
         let rotation = UnitQuaternion::face_towards(&forward, &-Vector3::z());
@@ -210,7 +240,7 @@ mod tests {
         };
         let depth_to_wall = |at_1_m: Point3<f64>| ((2.0 - eye.y) / (at_1_m.y - eye.y)) as f32;
         depth.depth_m = points(&depth).map(depth_to_wall).collect();
-        ObservedView { stamp: Stamp(secs * 1_000_000_000), depth, pixel_rad: 1.0 / 600.0, is_measured }
+        PosedDepth { stamp: Stamp(secs * 1_000_000_000), depth, pixel_rad: 1.0 / 600.0, is_measured }
     }
 
     /// The map's entry for the cell that contains a point.
@@ -238,7 +268,7 @@ mod tests {
     }
 
     /// Whether a point is inside the image of a view.
-    fn sees(view: &ObservedView, point: [f64; 3]) -> bool {
+    fn sees(view: &PosedDepth, point: [f64; 3]) -> bool {
         let in_camera = view.depth.world_from_camera.inverse() * Point3::from(point);
         (0..2).all(|axis| {
             let pixel = FOCAL_PX * in_camera[axis] / in_camera.z + view.depth.principal_px[axis];

@@ -4,15 +4,15 @@ mod map;
 
 use keyframe::{DepthMap, Keyframe};
 use kinematics::{Stamp, Transform};
-use map::ObservedView;
+use map::PosedDepth;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
-use trainer::{Picture, Projection, RenderRequest};
+use trainer::{Edits, Picture, Projection, RenderRequest};
 use viz::{Hub, KeyframePose};
 
-/// Maximum width of the depth maps. A cell of the map then meets several rays of most views.
+/// Maximum width of the depth maps. A cell of the map then meets several rays of most keyframes.
 const MAX_WIDTH_PX: u32 = 96;
 /// Minimum time between two checks, and between two maps.
 const CHECK_PERIOD: Duration = Duration::from_millis(50);
@@ -33,14 +33,24 @@ type Key = (Arc<str>, Stamp);
 
 /// A keyframe whose camera has observed the scene.
 #[derive(Clone, Debug)]
-pub(crate) struct SeenFrom {
+pub(crate) struct PosedKeyframe {
     /// Pose and intrinsics, with corrections.
     pub(crate) pose: KeyframePose,
     /// The keyframe, if it is available. If it has depth, no depth is rendered.
     pub(crate) keyframe: Option<Arc<Keyframe>>,
 }
 
-/// Depth of a view at a low resolution.
+/// What the map depends on besides the keyframes.
+pub(crate) struct ModelState<'a> {
+    /// Training step.
+    pub(crate) step: u64,
+    /// Its edits.
+    pub(crate) edits: &'a Arc<Edits>,
+    /// When a keyframe was captured; `None` if that was not in this process.
+    pub(crate) captured_at: &'a dyn Fn(&KeyframePose) -> Option<Instant>,
+}
+
+/// Depth of a keyframe at a low resolution.
 #[derive(Clone, Debug)]
 struct KnownDepth {
     /// The depth map; its pose is relative to the color camera.
@@ -54,6 +64,8 @@ struct KnownDepth {
 pub(crate) struct ObservationPublisher {
     hub: Hub,
     depths: BTreeMap<Key, KnownDepth>,
+    /// Edits with which the depth was rendered.
+    edits: Arc<Edits>,
     /// Whether a depth has changed since the last map.
     is_changed: bool,
     /// Poses in the last map.
@@ -70,6 +82,7 @@ impl ObservationPublisher {
         Self {
             hub,
             depths: BTreeMap::new(),
+            edits: Arc::default(),
             is_changed: false,
             mapped: BTreeMap::new(),
             task: None,
@@ -89,54 +102,59 @@ impl ObservationPublisher {
         Instant::now() >= self.next_check
     }
 
-    /// Renders missing depth of these views with `render`, a few per call, and starts to compute the map if it has
-    /// changed. `step`: training step of the model. `newest_at`: when the newest view was captured in this process.
-    /// Returns the time spent.
+    /// Renders missing depth of the keyframes with `render`, a few per call, and starts to compute the map if it has
+    /// changed. Returns the time spent.
     pub(crate) fn publish(
         &mut self,
-        views: &[SeenFrom],
-        step: u64,
-        newest_at: Option<Instant>,
+        keyframes: &[PosedKeyframe],
+        model: &ModelState<'_>,
         render: impl FnMut(&RenderRequest) -> Result<Picture, trainer::Error>,
     ) -> Duration {
         let began = Instant::now();
-        let keys: BTreeSet<Key> = views.iter().map(SeenFrom::key).collect();
+        if !Arc::ptr_eq(&self.edits, model.edits) {
+            // Surfaces may have become visible.
+            self.edits = Arc::clone(model.edits);
+            self.depths.retain(|_, known| known.is_measured);
+        }
+        let keys: BTreeSet<Key> = keyframes.iter().map(PosedKeyframe::key).collect();
         let n_before = self.depths.len();
         self.depths.retain(|key, _| keys.contains(key));
         self.is_changed |= self.depths.len() < n_before;
-        self.add_measured(views);
-        self.render_depths(views, step, render);
-        self.start_map(views, newest_at);
+        self.add_measured(keyframes);
+        self.render_depths(keyframes, model.step, render);
+        self.start_map(keyframes, model.captured_at);
         let spent = began.elapsed();
         self.next_check = Instant::now() + CHECK_PERIOD.max(spent.div_f64(MAX_RENDER_FRAC));
         spent
     }
 
-    fn add_measured(&mut self, views: &[SeenFrom]) {
-        for view in views {
-            let Some(depth) = view.keyframe.as_ref().and_then(|keyframe| measured_depth(keyframe)) else { continue };
-            let std::collections::btree_map::Entry::Vacant(entry) = self.depths.entry(view.key()) else { continue };
+    fn add_measured(&mut self, keyframes: &[PosedKeyframe]) {
+        for keyframe in keyframes {
+            let Some(depth) = keyframe.keyframe.as_ref().and_then(|keyframe| measured_depth(keyframe)) else {
+                continue;
+            };
+            let std::collections::btree_map::Entry::Vacant(entry) = self.depths.entry(keyframe.key()) else { continue };
             entry.insert(KnownDepth { depth: depth(), is_measured: true, step: u64::MAX });
             self.is_changed = true;
         }
     }
 
-    /// Renders depth for the newest views that have none, and then for those whose depth is oldest.
+    /// Renders depth for the newest keyframes that have none, and then for those whose depth is oldest.
     fn render_depths(
         &mut self,
-        views: &[SeenFrom],
+        keyframes: &[PosedKeyframe],
         step: u64,
         mut render: impl FnMut(&RenderRequest) -> Result<Picture, trainer::Error>,
     ) {
         #[expect(clippy::cast_precision_loss, reason = "steps are far below 2^52")]
         let is_outdated = |known: &KnownDepth| !known.is_measured && step as f64 > STEP_FACTOR * known.step as f64;
-        let rendered_at = |view: &SeenFrom| self.depths.get(&view.key()).map(|known| known.step);
+        let rendered_at = |keyframe: &PosedKeyframe| self.depths.get(&keyframe.key()).map(|known| known.step);
         let mut due: Vec<_> =
-            views.iter().filter(|view| self.depths.get(&view.key()).is_none_or(is_outdated)).collect();
-        due.sort_by_key(|view| (rendered_at(view), std::cmp::Reverse(view.pose.stamp.0)));
+            keyframes.iter().filter(|keyframe| self.depths.get(&keyframe.key()).is_none_or(is_outdated)).collect();
+        due.sort_by_key(|keyframe| (rendered_at(keyframe), std::cmp::Reverse(keyframe.pose.stamp.0)));
         let began = Instant::now();
-        for view in due {
-            let request = depth_request(&view.pose);
+        for keyframe in due {
+            let request = depth_request(&keyframe.pose, &self.edits);
             let depth = match render(&request) {
                 Ok(picture) => depth_map(&request, picture),
                 Err(error) => {
@@ -145,7 +163,7 @@ impl ObservationPublisher {
                     return;
                 }
             };
-            self.depths.insert(view.key(), KnownDepth { depth, is_measured: false, step });
+            self.depths.insert(keyframe.key(), KnownDepth { depth, is_measured: false, step });
             self.is_changed = true;
             if began.elapsed() >= RENDER_TIME {
                 return;
@@ -154,24 +172,26 @@ impl ObservationPublisher {
     }
 
     /// Starts to compute the map if it has changed and the last one is complete.
-    fn start_map(&mut self, views: &[SeenFrom], newest_at: Option<Instant>) {
+    fn start_map(&mut self, keyframes: &[PosedKeyframe], captured_at: &dyn Fn(&KeyframePose) -> Option<Instant>) {
         if let Some((began, _)) = self.task.take_if(|(_, thread)| thread.is_finished()) {
             self.next_map = began + MAP_PERIOD.max(began.elapsed().div_f64(MAX_MAP_FRAC));
         }
         if self.task.is_some() || Instant::now() < self.next_map {
             return;
         }
-        let has_moved = |view: &SeenFrom| match self.mapped.get(&view.key()) {
-            Some(mapped) => is_noticeable(&(mapped.inverse() * view.pose.world_from_camera)),
+        let has_moved = |keyframe: &PosedKeyframe| match self.mapped.get(&keyframe.key()) {
+            Some(mapped) => is_noticeable(&(mapped.inverse() * keyframe.pose.world_from_camera)),
             None => false, // It has no depth yet.
         };
-        if !self.is_changed && !views.iter().any(has_moved) {
+        if !self.is_changed && !keyframes.iter().any(has_moved) {
             return;
         }
-        let known = views.iter().filter_map(|view| Some((view, self.depths.get(&view.key())?)));
-        let observed: Vec<_> = known.clone().map(|(view, known)| known.seen_from(&view.pose)).collect();
-        self.mapped = known.map(|(view, _)| (view.key(), view.pose.world_from_camera)).collect();
+        let known = keyframes.iter().filter_map(|keyframe| Some((keyframe, self.depths.get(&keyframe.key())?)));
+        let observed: Vec<_> = known.clone().map(|(keyframe, known)| known.posed(&keyframe.pose)).collect();
+        self.mapped = known.clone().map(|(keyframe, _)| (keyframe.key(), keyframe.pose.world_from_camera)).collect();
         self.is_changed = false;
+        let newest = known.max_by_key(|(keyframe, _)| keyframe.pose.stamp.0);
+        let newest_at = newest.and_then(|(keyframe, _)| captured_at(&keyframe.pose));
         let hub = self.hub.clone();
         let compute = move || {
             if let Some(map) = map::map_of(&observed) {
@@ -182,17 +202,17 @@ impl ObservationPublisher {
     }
 }
 
-impl SeenFrom {
+impl PosedKeyframe {
     fn key(&self) -> Key {
         (Arc::clone(&self.pose.camera), self.pose.stamp)
     }
 }
 
 impl KnownDepth {
-    /// The view with the current pose of its color camera.
-    fn seen_from(&self, pose: &KeyframePose) -> ObservedView {
+    /// The keyframe with the current pose of its color camera.
+    fn posed(&self, pose: &KeyframePose) -> PosedDepth {
         let world_from_camera = pose.world_from_camera * self.depth.world_from_camera;
-        ObservedView {
+        PosedDepth {
             stamp: pose.stamp,
             depth: DepthMap { world_from_camera, ..self.depth.clone() },
             pixel_rad: 1.0 / pose.focal_px[0],
@@ -215,8 +235,8 @@ fn measured_depth(keyframe: &Keyframe) -> Option<impl FnOnce() -> DepthMap> {
     })
 }
 
-/// The request for the depth of a view at a low resolution.
-fn depth_request(pose: &KeyframePose) -> RenderRequest {
+/// The request for the depth of a keyframe at a low resolution.
+fn depth_request(pose: &KeyframePose, edits: &Arc<Edits>) -> RenderRequest {
     let scale = f64::from(MAX_WIDTH_PX.min(pose.size_px[0])) / f64::from(pose.size_px[0]);
     #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "smaller than the image")]
     let size_px = pose.size_px.map(|size| ((f64::from(size) * scale).round() as u32).max(1));
@@ -230,7 +250,7 @@ fn depth_request(pose: &KeyframePose) -> RenderRequest {
         near_m: 0.01,
         far_m: 100.0,
         crop: None,
-        edits: Arc::default(),
+        edits: Arc::clone(edits),
         background_srgb: [0.0; 3],
         appearance_of: None,
         depth: true,
