@@ -420,7 +420,8 @@ export class OrbitView {
     this.local.setView(view, [this.canvas.width, this.canvas.height]);
     const hasDepthBuffer = isLocal && this.local.hasDepth;
     this.occlusion.usesDepthBuffer = hasDepthBuffer;
-    this.occlusion.local = isLocal && !hasDepthBuffer && this.occlusion.enabled ? this.splatDepth(view) : null;
+    const needsSplatDepth = isLocal && !hasDepthBuffer && this.occlusion.enabled && this.hasOccludable;
+    this.occlusion.local = needsSplatDepth ? this.splatDepth(view) : null;
     this.crop.update();
     this.measure.update();
     this.renderer.clear();
@@ -429,10 +430,17 @@ export class OrbitView {
     this.renderer.render(this.world, this.camera);
   }
 
-  /** Draws the depth of the splats as seen in the view. */
-  private splatDepth(view: View): OcclusionDepth {
+  /** Whether anything is drawn that the model can hide. */
+  private get hasOccludable(): boolean {
+    return [this.robot, this.points, this.scans, this.overlays].some((layer) => layer.isVisible);
+  }
+
+  /** Draws the depth of the splats as seen in the view; null if that is not possible. */
+  private splatDepth(view: View): OcclusionDepth | null {
+    const texture = this.local.drawDepth(this.renderer, this.camera, [this.canvas.width, this.canvas.height]);
+    if (!texture) return null;
     return {
-      texture: this.local.drawDepth(this.renderer, this.camera, [this.canvas.width, this.canvas.height]),
+      texture,
       isWeighted: true,
       worldFromPicture: worldFromCamera(view.world_from_camera),
       sizePx: view.size_px,
