@@ -171,11 +171,10 @@ function showStatus(status: Status): void {
   const model = models.shown(status);
   readouts.show(status, model);
   const isEdited = edits.show(model);
-  if (model.step !== latestStep || isEdited) {
-    scheduler.modelChanged();
-    surroundings.modelChanged();
-  }
+  const isChanged = model.step !== latestStep;
+  if (isChanged || isEdited) scheduler.modelChanged();
   if (isEdited) forgetSurfaces();
+  else if (isChanged) surroundings.modelChanged();
   latestStep = model.step;
   updateLocalModel(model);
 }

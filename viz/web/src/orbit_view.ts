@@ -25,9 +25,9 @@ import { surfacePoint } from "./surface_picker";
 const VERTICAL_FOV_DEGREES = 50;
 /** Duration of the motion back to the front of a surface. */
 const RETURN_MILLIS = 250;
-/** The surroundings of an eye are needed closer to surfaces than this, in radii of the scene, ... */
-const NEAR_SHARE = 1 / 3;
-/** ... and for this long after it has come closer to its target or was stopped. */
+/** Closer to surfaces than this, in radii of the scene, new surroundings of the eye are needed: older ones are too coarse. */
+const NEAR_SHARE = 1 / 2;
+/** The same holds for this long after the eye has come closer to its target or was stopped. */
 const APPROACH_MILLIS = 1000;
 /** An orbit changes the distance to the target by rounding errors; an approach to less than this part of it. */
 const MIN_APPROACH = 1 - 1e-6;
