@@ -51,7 +51,7 @@ export class EyeGuard {
   jump(viewpoint: Viewpoint, isGood: boolean): void {
     this.trail = [copy(viewpoint)];
     this.hasGood = isGood;
-    if (!isGood) this.forget(); // The maps show other surroundings.
+    if (!isGood) this.maps.clear(); // They show other surroundings.
   }
 
   /** Forgets what is known about the model. */
