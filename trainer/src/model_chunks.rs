@@ -36,6 +36,9 @@ pub struct ChunkData {
     pub bytes: Vec<u8>,
 }
 
+/// Largest count of the position of a vertex in a mesh, along each axis.
+pub const MAX_MESH_COUNT: u16 = 33 * 1024;
+
 /// Layout of an encoded chunk.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 #[serde(tag = "kind", rename_all = "snake_case")]

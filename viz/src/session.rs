@@ -138,7 +138,7 @@ impl Reader<'_> {
             }),
             ClientMessage::Render(message) => {
                 let view_request = ViewRequest::check(&message)?;
-                if let Some(viewpoint) = Viewpoint::of(&view_request.request) {
+                if let Some(viewpoint) = Viewpoint::of(&view_request) {
                     self.demand.send_modify(|demand| demand.viewpoint = Some(viewpoint));
                 }
                 if !self.hub.view_request(self.client, view_request) {

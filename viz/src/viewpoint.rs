@@ -1,10 +1,11 @@
 //! Where a client looks from, and in which direction. It decides which chunks of a model the client gets first.
 
+use crate::view_request::ViewRequest;
 use kinematics::Transform;
 use nalgebra::{Point3, Vector3};
-use trainer::{ChunkLayout, Projection, RenderRequest};
+use trainer::{ChunkLayout, MAX_MESH_COUNT, Projection};
 
-/// The camera of a client's newest pinhole picture.
+/// The camera of the newest pinhole picture of a client's main view.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Viewpoint {
     camera_from_world: Transform,
@@ -13,8 +14,12 @@ pub(crate) struct Viewpoint {
 }
 
 impl Viewpoint {
-    /// The viewpoint of a request; `None` if it shows all directions.
-    pub(crate) fn of(request: &RenderRequest) -> Option<Self> {
+    /// The viewpoint of a request; `None` if it is for a named view or shows all directions.
+    pub(crate) fn of(view_request: &ViewRequest) -> Option<Self> {
+        let request = &view_request.request;
+        if !view_request.view.is_empty() {
+            return None;
+        }
         let Projection::Pinhole { focal_px, principal_px } = request.projection else { return None };
         let farthest = |axis: usize| {
             let side = f64::from(request.size_px[axis]);
@@ -42,7 +47,7 @@ impl Viewpoint {
 fn bounds(layout: &ChunkLayout) -> (Point3<f64>, f64) {
     let [min, max] = match layout {
         ChunkLayout::Mesh { origin_m, meters_per_count, .. } => {
-            [*origin_m, origin_m.map(|origin| origin + f64::from(u16::MAX) * meters_per_count)]
+            [*origin_m, origin_m.map(|origin| origin + f64::from(MAX_MESH_COUNT) * meters_per_count)]
         }
         ChunkLayout::Splats { min_m, max_m, .. } => [min_m, max_m].map(|corner| corner.map(f64::from)),
     }
@@ -56,17 +61,21 @@ pub(crate) mod tests {
     use crate::view_request::ViewRequest;
     use kinematics::Transform;
     use serde_json::json;
-    use trainer::ChunkLayout;
+    use trainer::{ChunkLayout, MAX_MESH_COUNT};
 
     /// A camera at the origin that looks along z, with a field of view of 90 degrees, moved and turned about y.
     pub(crate) fn viewpoint(x_m: f64, angle_rad: f64) -> Viewpoint {
+        Viewpoint::of(&request("", x_m, angle_rad)).expect("a pinhole")
+    }
+
+    fn request(view: &str, x_m: f64, angle_rad: f64) -> ViewRequest {
         let (sine, cosine) = angle_rad.sin_cos();
         let message = json!({
-            "id": 1, "size_px": [100, 2], "projection": {"kind": "pinhole", "focal_px": [50, 50]},
+            "id": 1, "view": view, "size_px": [100, 2], "projection": {"kind": "pinhole", "focal_px": [50, 50]},
             "world_from_camera": [cosine, 0, sine, x_m, 0, 1, 0, 0, -sine, 0, cosine, 0, 0, 0, 0, 1],
         });
         let message = serde_json::from_value(message).expect("a message");
-        Viewpoint::of(&ViewRequest::check(&message).expect("valid").request).expect("a pinhole")
+        ViewRequest::check(&message).expect("valid")
     }
 
     /// Splats in a cube with sides of 0.2 m.
@@ -80,6 +89,27 @@ pub(crate) mod tests {
             sh_degree: 0,
             sh_ranges: [0.0; 2],
         }
+    }
+
+    #[test]
+    fn named_views_are_no_viewpoints() {
+        assert!(
+            Viewpoint::of(&request("", 0.0, 0.0)).is_some() && Viewpoint::of(&request("inset", 0.0, 0.0)).is_none()
+        );
+    }
+
+    #[test]
+    fn bounds_of_a_mesh_chunk_end_at_its_largest_count() {
+        let side_m = 1.0;
+        let layout = ChunkLayout::Mesh {
+            origin_m: [0.0, 0.0, -1.5],
+            meters_per_count: side_m / f64::from(MAX_MESH_COUNT),
+            n_vertices: 3,
+            n_triangles: 1,
+        };
+        let (is_outside, distance_m) = viewpoint(0.0, 0.0).rank(&Transform::identity(), &layout);
+        assert!((distance_m - 1.5_f64.sqrt()).abs() < 1e-9, "{distance_m} m to the center");
+        assert!(is_outside, "the chunk ends behind the camera");
     }
 
     #[test]

@@ -229,8 +229,9 @@ impl Writer<'_> {
     fn message_of(&self, mut packed: PackedPicture) -> Vec<u8> {
         let sent_at = Instant::now();
         let message = packed.message(sent_at, self.server_context.clock);
-        if let Some(trained_on) = packed.trained_on.filter(|_| packed.header.last) {
-            let request = &packed.job.view_request;
+        let request = &packed.job.view_request;
+        // Depth alone shows no keyframes.
+        if let Some(trained_on) = packed.trained_on.filter(|_| packed.header.last && request.color) {
             let (id, view, method) = (request.id, Arc::clone(&request.view), request.method.clone());
             let picture = SentPicture { id, view, method, n_keyframes: trained_on.n, sent_at };
             self.server_context.hub.picture_sent(self.client, picture);

@@ -14,11 +14,11 @@ use kinematics::Transform;
 use nalgebra::{Point3, UnitQuaternion, Vector3};
 use serde_json::json;
 use std::path::PathBuf;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 use trainer::{Picture, Projection, RenderRequest};
-use viz::{Hub, SceneHint, Server, ServerConfig};
+use viz::{Hub, ModelStatus, SceneHint, Server, ServerConfig, Status};
 
 const WINDOW_PX: [u32; 2] = [900, 440];
 /// Inner sides of the walls, and a pillar in the room: corners, meters.
@@ -50,15 +50,16 @@ fn crossings(eye: Point3<f64>, direction: Vector3<f64>, [min, max]: [[f64; 3]; 2
     (range[0] < range[1]).then_some(range)
 }
 
-/// The room with the depth of its surfaces, which are visible from both sides.
+/// The room, with or without its pillar, and the depth of its surfaces, which are visible from both sides.
 #[expect(clippy::cast_possible_truncation, reason = "depths are meters")]
-fn draw(request: &RenderRequest) -> Picture {
+fn draw(request: &RenderRequest, has_pillar: bool) -> Picture {
     let [width, height] = request.size_px;
     let outside = [ROOM[0].map(|min| min - WALL_M), ROOM[1].map(|max| max + WALL_M)];
     let (mut rgba_srgb, mut depth_m) = (Vec::new(), Vec::new());
     for (x, y) in (0..height).flat_map(|y| (0..width).map(move |x| (x, y))) {
         let (eye, direction) = ray_in_world(request, f64::from(x) + 0.5, f64::from(y) + 0.5);
-        let hits = [ROOM, PILLAR, outside].into_iter().filter_map(|corners| crossings(eye, direction, corners));
+        let boxes = [ROOM, outside].into_iter().chain(has_pillar.then_some(PILLAR));
+        let hits = boxes.filter_map(|corners| crossings(eye, direction, corners));
         let depth = hits.flatten().filter(|depth| *depth > request.near_m).fold(f64::INFINITY, f64::min);
         let hit = eye + direction * depth;
         let is_dark = hit.iter().map(|along| (along * 4.0).floor()).sum::<f64>().rem_euclid(2.0) < 0.5;
@@ -71,7 +72,9 @@ fn draw(request: &RenderRequest) -> Picture {
 /// Draws the room on a thread, and records the requests for the main view.
 struct Renderer {
     requests: Arc<Mutex<Vec<RenderRequest>>>,
+    n_panoramas: Arc<AtomicUsize>,
     has_panoramas: Arc<AtomicBool>,
+    has_pillar: Arc<AtomicBool>,
     stop: Arc<AtomicBool>,
     thread: Option<std::thread::JoinHandle<()>>,
 }
@@ -79,23 +82,27 @@ struct Renderer {
 impl Renderer {
     fn start(hub: Hub) -> Self {
         let requests: Arc<Mutex<Vec<RenderRequest>>> = Arc::default();
-        let (has_panoramas, stop) = (Arc::new(AtomicBool::new(true)), Arc::new(AtomicBool::new(false)));
-        let (received, panoramas, stopped) = (Arc::clone(&requests), Arc::clone(&has_panoramas), Arc::clone(&stop));
+        let [has_panoramas, has_pillar, stop] = [true, true, false].map(|is_on| Arc::new(AtomicBool::new(is_on)));
+        let n_panoramas: Arc<AtomicUsize> = Arc::default();
+        let (received, n_received, stopped) = (Arc::clone(&requests), Arc::clone(&n_panoramas), Arc::clone(&stop));
+        let (panoramas, pillar) = (Arc::clone(&has_panoramas), Arc::clone(&has_pillar));
         let thread = std::thread::spawn(move || {
             while !stopped.load(Ordering::Relaxed) {
                 hub.wait_for_request(Duration::from_millis(50));
                 let Some(pending) = hub.next_request() else { continue };
-                if pending.request.projection != Projection::Equirectangular {
+                let is_panorama = pending.request.projection == Projection::Equirectangular;
+                n_received.fetch_add(usize::from(is_panorama), Ordering::Relaxed);
+                if !is_panorama {
                     received.lock().expect("no panic").push(pending.request.clone());
                 } else if !panoramas.load(Ordering::Relaxed) {
                     pending.fail("no panoramas");
                     continue;
                 }
-                let picture = draw(&pending.request);
+                let picture = draw(&pending.request, pillar.load(Ordering::Relaxed));
                 pending.deliver(picture);
             }
         });
-        Self { requests, has_panoramas, stop, thread: Some(thread) }
+        Self { requests, n_panoramas, has_panoramas, has_pillar, stop, thread: Some(thread) }
     }
 
     fn n_requests(&self) -> usize {
@@ -138,32 +145,33 @@ struct Page {
     _alone: MutexGuard<'static, ()>,
     browser: Browser,
     renderer: Renderer,
+    hub: Hub,
     profile: PathBuf,
     _server: Server,
 }
 
 impl Page {
     /// `None` without Chromium.
-    fn open(name: &str, has_panoramas: bool) -> Option<Self> {
+    fn open(name: &str, has_panoramas: bool, radius_m: f64) -> Option<Self> {
         let program = browser_for_page()?;
         let alone = BROWSER.lock().unwrap_or_else(PoisonError::into_inner);
         let hub = Hub::new();
         let toward = Vector3::new(1.0, -0.25, -0.1);
         hub.set_scene_hint(SceneHint {
             center_m: [0.0, 0.0, 1.0],
-            radius_m: RADIUS_M,
+            radius_m,
             world_from_camera: Transform::from_parts(
                 FIRST_EYE.into(),
                 UnitQuaternion::face_towards(&toward, &-Vector3::z()),
             ),
         });
         let server = Server::start(ServerConfig { listen: ([127, 0, 0, 1], 0).into() }, hub.clone()).expect("a port");
-        let renderer = Renderer::start(hub);
+        let renderer = Renderer::start(hub.clone());
         renderer.has_panoramas.store(has_panoramas, Ordering::Relaxed);
         let scratch = PathBuf::from(env!("CARGO_TARGET_TMPDIR"));
         let profile = scratch.join(format!("chromium-{name}-{}", std::process::id()));
         let browser = Browser::open_with(&program, &profile, &server.url(), WINDOW_PX, WEBGL_STUB);
-        let mut page = Self { _alone: alone, browser, renderer, profile, _server: server };
+        let mut page = Self { _alone: alone, browser, renderer, hub, profile, _server: server };
         page.rest();
         Some(page)
     }
@@ -217,17 +225,33 @@ impl Page {
 
     /// Holds keys down; returns how far the eye has moved.
     fn hold(&mut self, codes: &[&str], duration: Duration) -> Vector3<f64> {
+        self.hold_timed(codes, duration).0
+    }
+
+    /// Holds keys down for at least this long; returns how far the eye has moved and how long they were down.
+    fn hold_timed(&mut self, codes: &[&str], duration: Duration) -> (Vector3<f64>, Duration) {
         let before = self.renderer.eye();
         codes.iter().for_each(|code| self.key("keyDown", code));
+        let began = Instant::now();
         std::thread::sleep(duration);
         self.browser.next_frame(); // On a busy computer, frames are rare.
+        let held = began.elapsed();
         codes.iter().for_each(|code| self.key("keyUp", code));
         self.rest();
-        self.renderer.eye() - before
+        (self.renderer.eye() - before, held)
+    }
+
+    fn n_panoramas(&self) -> usize {
+        self.renderer.n_panoramas.load(Ordering::Relaxed)
+    }
+
+    fn set_model(&self, step: u64, edits: usize) {
+        let model = ModelStatus { step, edits, ..ModelStatus::default() };
+        self.hub.set_status(Status { state: "training".to_owned(), model, ..Status::default() });
     }
 
     fn close(self) {
-        let Self { browser, renderer, profile, _server: server, _alone: alone } = self;
+        let Self { browser, renderer, hub: _, profile, _server: server, _alone: alone } = self;
         drop(browser);
         drop((renderer, server));
         std::fs::remove_dir_all(&profile).expect("the browser has left its profile");
@@ -248,7 +272,7 @@ impl Random {
 
 #[test]
 fn the_eye_stays_in_front_of_walls() {
-    let Some(mut page) = Page::open("eye", true) else { return };
+    let Some(mut page) = Page::open("eye", true, RADIUS_M) else { return };
     assert!((page.renderer.eye() - FIRST_EYE.coords).norm() < 1e-6);
     // Straight to a wall: the eye stops close to it, and can leave.
     page.pivot([200, 200]);
@@ -289,7 +313,7 @@ fn the_eye_stays_in_front_of_walls() {
 
 #[test]
 fn an_eye_that_has_passed_an_unknown_wall_returns() {
-    let Some(mut page) = Page::open("return", false) else { return };
+    let Some(mut page) = Page::open("return", false, RADIUS_M) else { return };
     // Backward, where no picture shows the wall.
     for _ in 0..12 {
         page.wheel(300);
@@ -309,9 +333,56 @@ fn an_eye_that_has_passed_an_unknown_wall_returns() {
     page.close();
 }
 
+/// The eye flies through the place of a pillar once it is erased, or once training has removed it.
+#[test]
+fn the_eye_passes_a_surface_that_is_gone() {
+    for (name, step, edits) in [("erased", 1, 1), ("trained", 2, 0)] {
+        let Some(mut page) = Page::open(name, true, RADIUS_M) else { return };
+        page.set_model(1, 0);
+        page.browser.click("toggle-fly");
+        page.hold(&["ShiftLeft", "KeyW"], Duration::from_millis(2000));
+        let before = page.renderer.eye();
+        assert!(clearance(before) < 0.3 && before.x < PILLAR[0][0], "{name}: the pillar stops the eye at {before}");
+        page.renderer.has_pillar.store(false, Ordering::Relaxed);
+        let n_panoramas = page.n_panoramas();
+        page.set_model(step, edits);
+        wait_for(&mut page.browser, "the new surroundings", |_| {
+            page.renderer.n_panoramas.load(Ordering::Relaxed) > n_panoramas
+        });
+        page.rest();
+        page.hold(&["ShiftLeft", "KeyW"], Duration::from_millis(2000));
+        let after = page.renderer.eye();
+        assert!(after.x > PILLAR[1][0] && after.x < ROOM[1][0], "{name}: the eye is at {after}");
+        page.close();
+    }
+}
+
+/// The surroundings of an eye that orbits far from all surfaces are requested once.
+#[test]
+fn surroundings_are_requested_only_where_they_are_needed() {
+    // Half of this radius is much less than the distance of the eye to the walls.
+    let Some(mut page) = Page::open("surroundings", true, 0.6) else { return };
+    wait_for(&mut page.browser, "the first surroundings", |_| page.renderer.n_panoramas.load(Ordering::Relaxed) > 0);
+    page.rest();
+    let n_panoramas = page.n_panoramas();
+    let before = page.renderer.eye();
+    for _ in 0..6 {
+        page.drag("left", [4, 0]);
+        std::thread::sleep(Duration::from_millis(200));
+    }
+    page.rest();
+    let moved_m = (page.renderer.eye() - before).norm();
+    assert!((0.1..0.6).contains(&moved_m), "an orbit by {moved_m} m");
+    assert_eq!(page.n_panoramas(), n_panoramas, "the eye has moved only through space that is known to be free");
+    page.browser.click("toggle-fly");
+    page.hold(&["KeyW"], Duration::from_millis(250));
+    assert!(page.n_panoramas() > n_panoramas, "a flying eye needs them");
+    page.close();
+}
+
 #[test]
 fn keys_and_thumbs_fly() {
-    let Some(mut page) = Page::open("fly", true) else { return };
+    let Some(mut page) = Page::open("fly", true, RADIUS_M) else { return };
     const TIME: Duration = Duration::from_millis(250);
     page.browser.click("toggle-fly");
     let [right, up, forward] =
@@ -331,10 +402,14 @@ fn keys_and_thumbs_fly() {
         ));
         assert!(!state.to_string().contains("true"), "{button}: {state}");
     }
-    let slow = page.hold(&["KeyW"], TIME).norm();
-    page.hold(&["KeyS"], TIME);
-    let fast = page.hold(&["ShiftLeft", "KeyW"], TIME).norm();
-    assert!(fast > 2.0 * slow, "{slow} m, with Shift {fast} m");
+    // To the right, where there is most space.
+    let [slow_m_s, fast_m_s] = [vec!["KeyD"], vec!["ShiftLeft", "KeyD"]].map(|codes| {
+        let (motion, held) = page.hold_timed(&codes, TIME);
+        page.browser.click("reset-view");
+        page.rest();
+        motion.norm() / held.as_secs_f64()
+    });
+    assert!(fast_m_s > 2.0 * slow_m_s, "{slow_m_s} m/s, with Shift {fast_m_s} m/s");
     // The view turns to the left, because the scene follows the mouse to the right.
     let eye = page.renderer.eye();
     page.drag("left", [120, 0]);

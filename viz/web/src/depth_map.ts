@@ -9,6 +9,8 @@ export interface DepthMap {
   readonly origin: Vector3;
   /** Whether surfaces are known in all directions. */
   readonly isComplete: boolean;
+  /** No surface is closer to the origin than this; negative infinity if that is not known in all directions. */
+  readonly nearestM: number;
   /** How far a point lies in front of the surface in its direction, meters: negative behind it, infinite if there is none. */
   clearance(point: Vector3): number;
   /** The largest clearance within the resolution of the map: negative only if the point is certainly behind a surface. */
@@ -21,6 +23,7 @@ export interface DepthMap {
 export class PictureDepthMap implements DepthMap {
   readonly origin: Vector3;
   readonly isComplete = false;
+  readonly nearestM = -Infinity;
   private readonly pictureFromWorld: Matrix4;
 
   constructor(private readonly posed: PosedDepth) {
@@ -51,6 +54,7 @@ export class PictureDepthMap implements DepthMap {
 export class PanoramaDepthMap implements DepthMap {
   readonly origin: Vector3;
   readonly isComplete = true;
+  readonly nearestM: number;
   private readonly pictureFromWorld: Matrix4;
 
   constructor(
@@ -60,6 +64,7 @@ export class PanoramaDepthMap implements DepthMap {
   ) {
     this.origin = new Vector3().setFromMatrixPosition(worldFromPicture);
     this.pictureFromWorld = worldFromPicture.clone().invert();
+    this.nearestM = depth.reduce((nearest, depthM) => (depthM > 0 ? Math.min(nearest, depthM) : nearest), Infinity);
   }
 
   clearance(point: Vector3): number {

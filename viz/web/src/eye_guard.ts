@@ -23,7 +23,7 @@ const MAX_TRAIL = 2000;
 const BALL = [0, 1, 2].flatMap((axis) => [-1, 1].map((sign) => new Vector3().setComponent(axis, sign)));
 
 /** An eye, and the point it looked at. */
-export interface Stand {
+export interface Viewpoint {
   eye: Vector3;
   target: Vector3;
 }
@@ -36,7 +36,7 @@ export class EyeGuard {
   nearM = 0.01;
   private readonly maps = new Map<string, DepthMap>();
   /** The places of the eye since the last one that is known to be good; the first is that one, if there is any. */
-  private trail: Stand[] = [];
+  private trail: Viewpoint[] = [];
   private hasGood = false;
   /** Whether maps of all directions arrive. Others do not show whether the eye has passed a surface beside it. */
   private hasComplete = false;
@@ -48,8 +48,8 @@ export class EyeGuard {
   }
 
   /** Starts at a place that the eye has not moved to; `isGood` if it is known to be in front of all surfaces. */
-  jump(stand: Stand, isGood: boolean): void {
-    this.trail = [copy(stand)];
+  jump(viewpoint: Viewpoint, isGood: boolean): void {
+    this.trail = [copy(viewpoint)];
     this.hasGood = isGood;
     if (!isGood) this.maps.clear(); // They show other surroundings.
   }
@@ -57,6 +57,19 @@ export class EyeGuard {
   /** Forgets what is known about the model. */
   forget(): void {
     this.maps.clear();
+    this.hasComplete = false;
+  }
+
+  /** Forgets the maps of all directions, because newer ones will not arrive. */
+  forgetComplete(): void {
+    for (const [name, map] of this.maps) if (map.isComplete) this.maps.delete(name);
+    this.hasComplete = false;
+  }
+
+  /** There are no surfaces within this distance of the eye, meters; negative if that is not known. */
+  freeRadiusM(eye: Vector3): number {
+    const radii = [...this.maps.values()].map((map) => map.nearestM - map.origin.distanceTo(eye));
+    return Math.max(-Infinity, ...radii);
   }
 
   /** The last place of the eye on the way to another one; `slides` continues along a surface. */
@@ -71,14 +84,14 @@ export class EyeGuard {
   }
 
   /** Records where the eye is. */
-  moved(stand: Stand): void {
-    this.trail.push(copy(stand));
-    // Beyond this length, the oldest places are given up, but not the good one.
-    if (this.trail.length > MAX_TRAIL) this.trail.splice(1, MAX_TRAIL / 2);
+  moved(viewpoint: Viewpoint): void {
+    this.trail.push(copy(viewpoint));
+    // Beyond this length, the oldest places are given up, and the oldest that remains is returned to.
+    if (this.trail.length > MAX_TRAIL) this.trail.splice(0, MAX_TRAIL / 2);
   }
 
   /** Adopts a newer map. Returns the place to return to if it shows that the eye has passed a surface. */
-  see(name: string, map: DepthMap): Stand | null {
+  see(name: string, map: DepthMap): Viewpoint | null {
     this.maps.set(name, map);
     const distances = this.trail.map(({ eye }) => eye.distanceToSquared(map.origin));
     const seenFrom = distances.lastIndexOf(Math.min(...distances));
@@ -105,7 +118,7 @@ export class EyeGuard {
     const direction = motion.clone().normalize();
     const hit = this.hitMesh(from, direction, length + margin);
     const n = Math.min(MAX_STEPS, Math.ceil(length / (STEP_MARGINS * margin)));
-    const maps = [...this.maps.values()].map((map) => ({ map, least: Math.min(0, this.clearanceOfBall(map, from)) }));
+    const maps = [...this.maps.values()].map((map) => ({ map, minM: Math.min(0, this.clearanceOfBall(map, from)) }));
     const complete = [...this.maps.values()].find((map) => map.isComplete);
     const wasKnown = this.isKnown(from);
     let eye = from.clone();
@@ -115,8 +128,8 @@ export class EyeGuard {
       // Out of unknown space, there is a way back to where the surroundings were seen from.
       const isBack = !wasKnown && complete && next.distanceTo(complete.origin) < eye.distanceTo(complete.origin);
       if (complete && !isBack && !this.isKnown(next)) return { eye, normal: null };
-      for (const { map, least } of maps) {
-        if (this.clearanceOfBall(map, next) < least) return { eye, normal: this.normal(map, eye) };
+      for (const { map, minM } of maps) {
+        if (this.clearanceOfBall(map, next) < minM) return { eye, normal: this.normal(map, eye) };
       }
       eye = next;
     }
@@ -131,7 +144,7 @@ export class EyeGuard {
     });
   }
 
-  /** Least clearance of points around the eye; those that are hidden are left out. */
+  /** Minimum clearance of points around the eye; those that are hidden are left out. */
   private clearanceOfBall(map: DepthMap, eye: Vector3): number {
     const clearances = BALL.map((point) => map.clearance(point.clone().multiplyScalar(this.marginM).add(eye)));
     return Math.min(...clearances.filter((clearance) => clearance > -MAX_DEPTH_MARGINS * this.marginM));
@@ -149,7 +162,7 @@ export class EyeGuard {
   }
 
   /** Whether a way that begins at the origin of a map passes one of its surfaces. */
-  private isCrossed(map: DepthMap, way: Stand[]): boolean {
+  private isCrossed(map: DepthMap, way: Viewpoint[]): boolean {
     const margin = this.marginM;
     return way.some(({ eye }, ix) => {
       const next = way[ix + 1]?.eye;
@@ -162,6 +175,6 @@ export class EyeGuard {
   }
 }
 
-function copy({ eye, target }: Stand): Stand {
+function copy({ eye, target }: Viewpoint): Viewpoint {
   return { eye: eye.clone(), target: target.clone() };
 }

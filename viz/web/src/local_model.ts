@@ -49,8 +49,8 @@ export class LocalModel {
     return this.progress.nChunks > 0;
   }
 
-  /** Draws the depth of the splats, see splat_depth.ts. */
-  drawDepth(renderer: THREE.WebGLRenderer, camera: THREE.Camera, sizePx: [number, number]): THREE.Texture {
+  /** Draws the depth of the splats, see splat_depth.ts; null if that is not possible. */
+  drawDepth(renderer: THREE.WebGLRenderer, camera: THREE.Camera, sizePx: [number, number]): THREE.Texture | null {
     return this.splats.drawDepth(renderer, camera, sizePx);
   }
 

@@ -68,6 +68,7 @@ const connection = new Connection(`${location.protocol === "https:" ? "wss" : "w
       robotAge.forget();
       scheduler.restart();
       shownLatency.forget();
+      forgetSurfaces();
       for (const side of sides) side.restart();
       view.points.clear();
       view.scans.clear();
@@ -93,7 +94,7 @@ const shownLatency = new ShownLatency(connection);
 const models = new ModelSwitch(() => {
   shownLatency.forget();
   scheduler.restart();
-  view.forgetSurfaces();
+  forgetSurfaces();
   if (latestStatus) showStatus(latestStatus);
 });
 let isDrawnLocally = false;
@@ -170,9 +171,18 @@ function showStatus(status: Status): void {
   const model = models.shown(status);
   readouts.show(status, model);
   const isEdited = edits.show(model);
-  if (model.step !== latestStep || isEdited) scheduler.modelChanged();
+  const isChanged = model.step !== latestStep;
+  if (isChanged || isEdited) scheduler.modelChanged();
+  if (isEdited) forgetSurfaces();
+  else if (isChanged) surroundings.modelChanged();
   latestStep = model.step;
   updateLocalModel(model);
+}
+
+/** Forgets where surfaces are, because the model is another one or parts of it are gone. */
+function forgetSurfaces(): void {
+  surroundings.forget();
+  view.forgetSurfaces();
 }
 
 /** Chooses whether the page or the server draws the model. */
@@ -332,8 +342,12 @@ function frame(): void {
   shownLatency.frameBegins();
   settings.tick();
   scheduler.tick();
-  // The first picture comes first.
-  if (view.picture.posedDepth && showsModel) surroundings.tick(view.view(), models.method);
+  if (!view.usesSurroundings || settings.isPlaying) {
+    surroundings.forget();
+    view.forgetSurroundings();
+  } else if (view.needsSurroundings) {
+    surroundings.tick(() => view.view(), models.method, view.isFlyingOrStopped);
+  }
   view.draw();
   requestAnimationFrame(frame);
 }

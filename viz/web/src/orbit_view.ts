@@ -6,7 +6,7 @@ import { pinholeOfThreeCamera, poseOfThreeCamera, worldFromCamera } from "./conv
 import type { PathView } from "./camera_path";
 import { CropBox } from "./crop_box";
 import { type DepthMap, PictureDepthMap } from "./depth_map";
-import { EyeGuard, type Stand } from "./eye_guard";
+import { EyeGuard, type Viewpoint } from "./eye_guard";
 import { FlyControls } from "./fly_controls";
 import { LocalModel } from "./local_model";
 import { MeasureTool } from "./measure";
@@ -25,6 +25,12 @@ import { surfacePoint } from "./surface_picker";
 const VERTICAL_FOV_DEGREES = 50;
 /** Duration of the motion back to the front of a surface. */
 const RETURN_MILLIS = 250;
+/** Closer to surfaces than this, in radii of the scene, new surroundings of the eye are needed: older ones are too coarse. */
+const NEAR_SHARE = 1 / 2;
+/** The same holds for this long after the eye has come closer to its target or was stopped. */
+const APPROACH_MILLIS = 1000;
+/** An orbit changes the distance to the target by rounding errors; an approach to less than this part of it. */
+const MIN_APPROACH = 1 - 1e-6;
 /** The color --ground in app.css. */
 export const BACKGROUND: [number, number, number] = [0x0b / 255, 0x0e / 255, 0x13 / 255];
 
@@ -45,10 +51,13 @@ export class OrbitView {
   private readonly controls: OrbitControls;
   private readonly fly: FlyControls;
   private readonly guard = new EyeGuard((from, direction, maxM) => this.local.hit(from, direction, maxM));
-  /** The stand after the last motion. */
-  private readonly stand: Stand = { eye: new THREE.Vector3(), target: new THREE.Vector3() };
+  /** The viewpoint after the last motion. */
+  private readonly viewpoint: Viewpoint = { eye: new THREE.Vector3(), target: new THREE.Vector3() };
   private isPlacing = false;
-  private returning: { from: Stand; to: Stand; began: number } | null = null;
+  /** When the eye last came closer to its target, and when a surface or unknown space last stopped it. */
+  private approachedAt = -Infinity;
+  private stoppedAt = -Infinity;
+  private returning: { from: Viewpoint; to: Viewpoint; began: number } | null = null;
   /** The part of the scene to draw. */
   readonly crop: CropBox;
   readonly measure: MeasureTool;
@@ -82,6 +91,7 @@ export class OrbitView {
     });
     this.crop = new CropBox(this.camera, canvas, () => {
       this.isStale = true;
+      this.forgetSurroundings();
       onMove();
     });
     this.measure = new MeasureTool(this.camera, canvas, (x, y) => this.surfaceAt(x, y), () => this.changed());
@@ -201,7 +211,7 @@ export class OrbitView {
   see(name: string, map: DepthMap): void {
     if (!this.isModelShown || this.returning) return;
     const good = this.guard.see(name, map);
-    if (good) this.returning = { from: this.copyOfStand(), to: good, began: performance.now() };
+    if (good) this.returning = { from: this.copyOfViewpoint(), to: good, began: performance.now() };
   }
 
   /** Adopts the depth of a new picture. */
@@ -215,44 +225,70 @@ export class OrbitView {
     this.guard.forget();
   }
 
+  /** Forgets the surroundings of the eye, because newer ones are not requested. */
+  forgetSurroundings(): void {
+    this.guard.forgetComplete();
+  }
+
+  /** Whether the user moves the eye in a model of which only pictures show the surfaces. */
+  get usesSurroundings(): boolean {
+    const isMesh = this.local.root.visible && this.local.hasDepth;
+    return this.isModelShown && this.picture.posedDepth !== null && !this.followsRobot && !isMesh;
+  }
+
+  /** Whether the eye may soon be at a surface. */
+  get needsSurroundings(): boolean {
+    const isApproaching = performance.now() - this.approachedAt < APPROACH_MILLIS;
+    const nearM = NEAR_SHARE * (this.scene?.radius_m ?? 0);
+    return this.isFlyingOrStopped || isApproaching || !(this.guard.freeRadiusM(this.camera.position) > nearM);
+  }
+
+  /** Whether changes of the model matter to the motion of the eye. */
+  get isFlyingOrStopped(): boolean {
+    return this.fly.enabled || performance.now() - this.stoppedAt < APPROACH_MILLIS;
+  }
+
   /** Called after each motion by the user: stops before surfaces. */
   private moved(): void {
     if (this.isPlacing) return;
     const { position } = this.camera;
     const { target } = this.controls;
     if (this.returning) {
-      this.place(this.copyOfStand());
+      this.place(this.copyOfViewpoint());
       return;
     }
-    if (position.equals(this.stand.eye) && target.equals(this.stand.target)) return;
-    const isShifted = !target.equals(this.stand.target);
+    if (position.equals(this.viewpoint.eye) && target.equals(this.viewpoint.target)) return;
+    const isShifted = !target.equals(this.viewpoint.target);
     const allowed = this.isModelShown ? this.guard.limit(position, isShifted) : position;
+    const isCloser = position.distanceTo(target) < MIN_APPROACH * this.viewpoint.eye.distanceTo(target);
+    if (!isShifted && isCloser) this.approachedAt = performance.now();
     if (!allowed.equals(position)) {
+      this.stoppedAt = performance.now();
       // Eye and target move together in shifts; otherwise, the eye moves around the target or toward it.
       if (isShifted) target.add(allowed).sub(position);
       position.copy(allowed);
       this.camera.lookAt(target);
-      if (position.equals(this.stand.eye) && target.equals(this.stand.target)) return;
+      if (position.equals(this.viewpoint.eye) && target.equals(this.viewpoint.target)) return;
     }
-    this.guard.moved(this.adoptStand());
+    this.guard.moved(this.adoptViewpoint());
     this.isStale = true;
     this.onMove();
   }
 
   /** Looks from another place, which need not be reachable. */
-  private jump(stand: Stand): void {
+  private jump(viewpoint: Viewpoint): void {
     this.returning = null;
-    this.place(stand);
-    this.guard.jump(this.stand, false);
+    this.place(viewpoint);
+    this.guard.jump(this.viewpoint, false);
   }
 
-  private place({ eye, target }: Stand): void {
+  private place({ eye, target }: Viewpoint): void {
     this.camera.position.copy(eye);
     this.controls.target.copy(target);
     this.isPlacing = true;
     this.controls.update();
     this.isPlacing = false;
-    this.adoptStand();
+    this.adoptViewpoint();
     this.isStale = true;
     this.onMove();
   }
@@ -262,21 +298,21 @@ export class OrbitView {
     if (!this.returning) return;
     const { from, to, began } = this.returning;
     const share = THREE.MathUtils.smoothstep((performance.now() - began) / RETURN_MILLIS, 0, 1);
-    const between = (get: (stand: Stand) => THREE.Vector3): THREE.Vector3 => get(from).clone().lerp(get(to), share);
-    this.place({ eye: between((stand) => stand.eye), target: between((stand) => stand.target) });
+    const between = (get: (viewpoint: Viewpoint) => THREE.Vector3): THREE.Vector3 => get(from).clone().lerp(get(to), share);
+    this.place({ eye: between(({ eye }) => eye), target: between(({ target }) => target) });
     if (share < 1) return;
     this.returning = null;
-    this.guard.jump(this.stand, true);
+    this.guard.jump(this.viewpoint, true);
   }
 
-  private adoptStand(): Stand {
-    this.stand.eye.copy(this.camera.position);
-    this.stand.target.copy(this.controls.target);
-    return this.stand;
+  private adoptViewpoint(): Viewpoint {
+    this.viewpoint.eye.copy(this.camera.position);
+    this.viewpoint.target.copy(this.controls.target);
+    return this.viewpoint;
   }
 
-  private copyOfStand(): Stand {
-    return { eye: this.stand.eye.clone(), target: this.stand.target.clone() };
+  private copyOfViewpoint(): Viewpoint {
+    return { eye: this.viewpoint.eye.clone(), target: this.viewpoint.target.clone() };
   }
 
   /** The point of the model's surface at a pixel of the canvas; null if there is none. */
@@ -384,7 +420,8 @@ export class OrbitView {
     this.local.setView(view, [this.canvas.width, this.canvas.height]);
     const hasDepthBuffer = isLocal && this.local.hasDepth;
     this.occlusion.usesDepthBuffer = hasDepthBuffer;
-    this.occlusion.local = isLocal && !hasDepthBuffer && this.occlusion.enabled ? this.splatDepth(view) : null;
+    const needsSplatDepth = isLocal && !hasDepthBuffer && this.occlusion.enabled && this.hasOccludable;
+    this.occlusion.local = needsSplatDepth ? this.splatDepth(view) : null;
     this.crop.update();
     this.measure.update();
     this.renderer.clear();
@@ -393,10 +430,17 @@ export class OrbitView {
     this.renderer.render(this.world, this.camera);
   }
 
-  /** Draws the depth of the splats as seen in the view. */
-  private splatDepth(view: View): OcclusionDepth {
+  /** Whether anything is drawn that the model can hide. */
+  private get hasOccludable(): boolean {
+    return [this.robot, this.points, this.scans, this.overlays].some((layer) => layer.isVisible);
+  }
+
+  /** Draws the depth of the splats as seen in the view; null if that is not possible. */
+  private splatDepth(view: View): OcclusionDepth | null {
+    const texture = this.local.drawDepth(this.renderer, this.camera, [this.canvas.width, this.canvas.height]);
+    if (!texture) return null;
     return {
-      texture: this.local.drawDepth(this.renderer, this.camera, [this.canvas.width, this.canvas.height]),
+      texture,
       isWeighted: true,
       worldFromPicture: worldFromCamera(view.world_from_camera),
       sizePx: view.size_px,

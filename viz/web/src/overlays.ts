@@ -34,6 +34,11 @@ export class Overlays {
     this.cameras.visible = visible;
   }
 
+  /** Whether there are lines to draw. */
+  get isVisible(): boolean {
+    return this.ground.visible || this.keyframes.visible;
+  }
+
   set showsKeyframes(visible: boolean) {
     this.keyframes.visible = visible;
     this.drawKeyframes();

@@ -52,10 +52,15 @@ export class PathVideo {
     this.worker = worker;
     try {
       await this.ask(worker, { kind: "begin", sizePx, frameRate: FRAMES_PER_SEC });
+      this.checkIsCurrent(worker);
       for (const [ix, frame] of frames.entries()) {
         progress(ix);
-        const bitmap = await bitmapOf(await this.side.request(this.request(frame, sizePx)));
+        const picture = await this.side.request(this.request(frame, sizePx));
+        this.checkIsCurrent(worker);
+        const bitmap = await bitmapOf(picture);
+        this.checkIsCurrent(worker);
         await this.ask(worker, { kind: "frame", bitmap }, [bitmap]);
+        this.checkIsCurrent(worker);
       }
       progress(frames.length);
       const last = await this.ask(worker, { kind: "end" });
@@ -66,6 +71,11 @@ export class PathVideo {
     } finally {
       if (this.worker === worker) this.end();
     }
+  }
+
+  /** Throws if the recording of a worker was cancelled, maybe in favor of another one. */
+  private checkIsCurrent(worker: Worker): void {
+    if (this.worker !== worker) throw new Error("cancelled");
   }
 
   private end(): void {

@@ -28,6 +28,11 @@ export class PointsLayer {
     if (!enabled) this.clear();
   }
 
+  /** Whether there are points to draw. */
+  get isVisible(): boolean {
+    return this.isEnabled && this.byKeyframe.size > 0;
+  }
+
   /** Adds the points of a keyframe, unless points are not drawn. */
   add(header: KeyframePointsHeader, payload: Uint8Array<ArrayBuffer>): void {
     if (!this.isEnabled) return;

@@ -48,6 +48,11 @@ export class RobotLayer {
     this.root.visible = this.isEnabled && this.hasState;
   }
 
+  /** Whether the robot is drawn. */
+  get isVisible(): boolean {
+    return this.root.visible;
+  }
+
   /** Creates the links of a robot. */
   setRobot(robot: Robot): void {
     const described = JSON.stringify(robot);

@@ -15,6 +15,7 @@ export class ScanLayer {
   private readonly material: THREE.PointsMaterial;
   private readonly byScanner = new Map<string, THREE.Points>();
   private readonly path: THREE.Line;
+  private hasPath = false;
 
   constructor(occlusion: Occlusion) {
     this.material = occlusion.apply(
@@ -31,6 +32,11 @@ export class ScanLayer {
   set enabled(enabled: boolean) {
     this.scans.visible = enabled;
     if (!enabled) this.clear();
+  }
+
+  /** Whether there is a scan or a path to draw. */
+  get isVisible(): boolean {
+    return (this.scans.visible && this.byScanner.size > 0) || this.hasPath;
   }
 
   /** Shows a scan in place of the scanner's previous one. */
@@ -51,6 +57,7 @@ export class ScanLayer {
 
   /** Shows the path of the base, in world. */
   setPath(points: [number, number, number][]): void {
+    this.hasPath = points.length > 1;
     this.path.geometry.dispose();
     this.path.geometry = new THREE.BufferGeometry().setFromPoints(points.map((point) => new THREE.Vector3(...point)));
   }

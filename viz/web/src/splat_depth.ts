@@ -9,6 +9,8 @@ const SCALE = 0.5;
 
 export class SplatDepth {
   private target: THREE.WebGLRenderTarget | null = null;
+  /** Whether the GPU can draw to the target; null before the first attempt. */
+  private isPossible: boolean | null = null;
   private readonly material: THREE.RawShaderMaterial;
 
   /** Draws with the uniforms of the material for colors. */
@@ -20,13 +22,17 @@ export class SplatDepth {
     this.material.defines = { WRITES_DEPTH: 1 };
   }
 
-  /** Draws the splats of a mesh. The texture holds the sum of the weighted depths, meters, and of the weights. */
+  /**
+   * Draws the splats of a mesh. The texture holds the sum of the weighted depths, meters, and of the weights. Returns
+   * null if the GPU cannot draw to textures of floats.
+   */
   draw(
     renderer: THREE.WebGLRenderer,
     mesh: THREE.Mesh<THREE.InstancedBufferGeometry, THREE.RawShaderMaterial>,
     camera: THREE.Camera,
     sizePx: [number, number],
-  ): THREE.Texture {
+  ): THREE.Texture | null {
+    if (this.isPossible === false) return null;
     const [width, height] = sizePx.map((side) => Math.ceil(SCALE * side)) as [number, number];
     this.target ??= depthTarget(renderer);
     this.target.setSize(width, height);
@@ -35,14 +41,22 @@ export class SplatDepth {
     const clearAlpha = renderer.getClearAlpha();
     mesh.material = this.material;
     renderer.setRenderTarget(this.target);
-    renderer.setClearColor(0, 0);
-    renderer.clear();
-    renderer.render(mesh, camera);
+    this.isPossible ??= isComplete(renderer.getContext());
+    if (this.isPossible) {
+      renderer.setClearColor(0, 0);
+      renderer.clear();
+      renderer.render(mesh, camera);
+    }
     renderer.setRenderTarget(null);
     renderer.setClearColor(clearColor, clearAlpha);
     mesh.material = colors;
-    return this.target.texture;
+    return this.isPossible ? this.target.texture : null;
   }
+}
+
+/** Whether the GPU can draw to the bound framebuffer. */
+function isComplete(gl: WebGLRenderingContext | WebGL2RenderingContext): boolean {
+  return gl.checkFramebufferStatus(gl.FRAMEBUFFER) === gl.FRAMEBUFFER_COMPLETE;
 }
 
 /** Floats of 32 bits if the GPU can blend them; those of 16 bits have an error of 0.05 % per splat. */

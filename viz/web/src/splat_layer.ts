@@ -124,8 +124,8 @@ export class SplatLayer {
     this.requestOrder(cameraFromModel.elements);
   }
 
-  /** Draws the depth of the view, see splat_depth.ts. */
-  drawDepth(renderer: THREE.WebGLRenderer, camera: THREE.Camera, sizePx: [number, number]): THREE.Texture {
+  /** Draws the depth of the view, see splat_depth.ts; null if that is not possible. */
+  drawDepth(renderer: THREE.WebGLRenderer, camera: THREE.Camera, sizePx: [number, number]): THREE.Texture | null {
     return this.depth.draw(renderer, this.mesh, camera, sizePx);
   }
 

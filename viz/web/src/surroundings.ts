@@ -8,9 +8,11 @@ import type { PictureRequest, SideView } from "./side_view";
 
 /** The server sends depth at half of this size. */
 const SIZE_PX: [number, number] = [192, 96];
-/** Pause between two requests, and the fraction of the time that may be spent on them. */
+/** Pause between two requests, and the fraction of the time that the server may spend on them. */
 const PAUSE_MILLIS = 150;
 const SHARE = 0.25;
+/** Minimum time between two requests for the same eye while the model changes. */
+const REFRESH_MILLIS = 2000;
 /** An answer that is later than this is not waited for. */
 const TIMEOUT_MILLIS = 30_000;
 
@@ -18,6 +20,9 @@ export class Surroundings {
   private requestedFor = "";
   private requestedAt = 0;
   private dueAt = 0;
+  private hasUpdate = false;
+  /** Counts the calls of `forget`; answers from before are dropped. */
+  private generation = 0;
 
   constructor(
     private readonly side: SideView,
@@ -26,20 +31,37 @@ export class Surroundings {
     private readonly fail: () => void,
   ) {}
 
-  /** Called for every display refresh. */
-  tick(view: View, method: string | undefined): void {
+  /** Called for every display refresh while the depth is needed. `follows` also requests it after changes of the model. */
+  tick(view: () => View, method: string | undefined, follows: boolean): void {
     const now = performance.now();
     if (this.side.isWaiting && now - this.requestedAt > TIMEOUT_MILLIS) this.side.abandon("no answer");
     if (this.side.isWaiting || now < this.dueAt || !this.side.isPossible) return;
-    const { world_from_camera: pose, crop } = view;
+    const current = view();
+    const { world_from_camera: pose, crop } = current;
     const key = JSON.stringify([pose[3], pose[7], pose[11], crop, method]);
-    if (key === this.requestedFor) return;
+    const isOutdated = follows && this.hasUpdate && now - this.requestedAt > REFRESH_MILLIS;
+    if (key === this.requestedFor && !isOutdated) return;
     this.requestedFor = key;
-    void this.request(view);
+    void this.request(current);
+  }
+
+  /** Called when the model has changed a little. */
+  modelChanged(): void {
+    this.hasUpdate = true;
+  }
+
+  /** Drops a pending answer, which shows another model, and requests the depth again even if the eye does not move. */
+  forget(): void {
+    this.generation += 1;
+    this.requestedFor = "";
+    this.side.abandon("the model is another one");
   }
 
   private async request(view: View): Promise<void> {
+    const { generation } = this;
     this.requestedAt = performance.now();
+    this.hasUpdate = false;
+    let millis = 0;
     try {
       const { header, payload } = await this.side.request({
         ...this.picture(view),
@@ -47,12 +69,14 @@ export class Surroundings {
         size_px: SIZE_PX,
         outputs: ["depth"],
       });
-      if (!header.depth) return;
-      const { depth, sizePx } = await decodeDepth(header.depth, payload);
-      this.adopt(new PanoramaDepthMap(worldFromCamera(header.world_from_camera), depth, sizePx));
+      millis = header.render_millis;
+      const decoded = header.depth ? await decodeDepth(header.depth, payload) : null;
+      if (generation !== this.generation || !decoded) return;
+      this.adopt(new PanoramaDepthMap(worldFromCamera(header.world_from_camera), decoded.depth, decoded.sizePx));
     } catch {
-      this.fail(); // The pictures of the main view still show surfaces.
+      if (generation === this.generation) this.fail(); // The pictures of the main view still show surfaces.
+    } finally {
+      this.dueAt = performance.now() + Math.max(PAUSE_MILLIS, millis * (1 / SHARE - 1));
     }
-    this.dueAt = performance.now() + Math.max(PAUSE_MILLIS, (performance.now() - this.requestedAt) * (1 / SHARE - 1));
   }
 }

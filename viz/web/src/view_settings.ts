@@ -48,6 +48,11 @@ export class ViewSettings {
     this.edit(() => undefined);
   }
 
+  /** Whether the view moves along the camera path. */
+  get isPlaying(): boolean {
+    return this.path.isPlaying;
+  }
+
   /** Called for every display refresh. */
   tick(): void {
     const shown = this.path.current();

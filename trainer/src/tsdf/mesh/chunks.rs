@@ -5,7 +5,7 @@
 
 use super::mesher::{BlockMesh, Mesher, shared_key, without_erased};
 use crate::edits::Edits;
-use crate::model_chunks::{ChunkData, ChunkLayout, ModelChunk, ModelChunks};
+use crate::model_chunks::{ChunkData, ChunkLayout, MAX_MESH_COUNT, ModelChunk, ModelChunks};
 use crate::tsdf::block::{BLOCK_EDGE, GridCoord};
 use crate::tsdf::chosen_grid::VoxelGrid;
 use flate2::Compression;
@@ -17,8 +17,8 @@ use std::sync::Arc;
 
 /// Blocks along an edge of a chunk: some thousand vertices, which a viewer draws at once.
 const CHUNK_BLOCKS: i32 = 4;
-/// Counts per voxel. A chunk and the cubes that begin in it span 33 voxels, which fit into 16 bits.
-const COUNTS_PER_VOXEL: f64 = 1024.0;
+/// Voxels along an edge of a chunk with the cubes that begin in it.
+const CHUNK_VOXELS: i32 = CHUNK_BLOCKS * BLOCK_EDGE + 1;
 /// Bits per axis in an id.
 const ID_BITS: u32 = 17;
 
@@ -83,7 +83,8 @@ fn id_of(coord: GridCoord) -> u64 {
 }
 
 fn encoded(coord: GridCoord, chunk: &ChunkBlocks, voxel_grid: &VoxelGrid) -> ModelChunk {
-    let meters_per_count = voxel_grid.voxel_m / COUNTS_PER_VOXEL;
+    let counts_per_voxel = f64::from(MAX_MESH_COUNT) / f64::from(CHUNK_VOXELS);
+    let meters_per_count = voxel_grid.voxel_m / counts_per_voxel;
     let origin_in_field_m =
         coord.map(|along| f64::from(along) * f64::from(CHUNK_BLOCKS * BLOCK_EDGE) * voxel_grid.voxel_m);
     let mut vertices = VertexWriter::default();
@@ -97,7 +98,7 @@ fn encoded(coord: GridCoord, chunk: &ChunkBlocks, voxel_grid: &VoxelGrid) -> Mod
             if ix == next {
                 let count = |axis: usize| {
                     let offset_m = f64::from(vertex.position_m[axis]) - origin_in_field_m[axis];
-                    (offset_m / meters_per_count).round().clamp(0.0, f64::from(u16::MAX))
+                    (offset_m / meters_per_count).round().clamp(0.0, f64::from(MAX_MESH_COUNT))
                 };
                 vertices.push([0, 1, 2].map(count), vertex.color);
             }
