@@ -169,7 +169,7 @@ function receiveText(message: TextMessage): void {
 function showStatus(status: Status): void {
   const model = models.shown(status);
   readouts.show(status, model);
-  const isEdited = edits.show(model);
+  const isEdited = edits.show(status, model);
   if (model.step !== latestStep || isEdited) scheduler.modelChanged();
   latestStep = model.step;
   updateLocalModel(model);
