@@ -19,7 +19,7 @@ use sim::{PinholeView, RobotMasks, Scene};
 use std::io::{BufRead, BufReader, ErrorKind};
 use std::net::TcpStream;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Stdio};
+use std::process::{Child, Command, Stdio};
 use std::sync::mpsc::{SyncSender, sync_channel};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
@@ -36,6 +36,8 @@ const BACKGROUND: [u8; 3] = [220, 0, 220];
 const MIN_CONTRAST: u8 = 24;
 /// Positions of the robot differ by at least this much, radians.
 const MIN_MOTION_RAD: f64 = 0.3;
+/// Maximum time until the robot has moved by this much.
+const TIMEOUT: Duration = Duration::from_secs(120);
 
 /// The robot and some of its states, as sent by a run.
 struct Robot {
@@ -43,22 +45,34 @@ struct Robot {
     states: Vec<Value>,
 }
 
+/// A run that is killed at the end of the test, or if it fails.
+struct Running(Child);
+
+impl Drop for Running {
+    fn drop(&mut self) {
+        let _ = self.0.kill(); // Fails if the process has already ended.
+        let _ = self.0.wait();
+    }
+}
+
 /// Receives the robot from a run of a simulated rig, until it has moved noticeably.
 fn robot_of_run() -> Robot {
     let folder = tempfile::tempdir().expect("a folder");
     small_rig::write(folder.path(), small_rig::Pace::RealTime);
-    let mut run = Command::new(env!("CARGO_BIN_EXE_fieldrig"))
+    let run = Command::new(env!("CARGO_BIN_EXE_fieldrig"))
         .args(["run", "rig.toml", "--sim", "--max-splats", "1000", "--out", "out", "--listen", "127.0.0.1:0", "--json"])
         .current_dir(folder.path())
         .stdout(Stdio::piped())
         .stderr(Stdio::null())
         .spawn()
         .expect("it is built");
-    let mut lines = BufReader::new(run.stdout.take().expect("piped")).lines().map_while(Result::ok);
+    let mut run = Running(run);
+    let mut lines = BufReader::new(run.0.stdout.take().expect("piped")).lines().map_while(Result::ok);
     let serving: Value = serde_json::from_str(&lines.next().expect("an event")).expect("JSON");
     let address = serving["url"].as_str().and_then(|url| url.strip_prefix("http://")).expect("a URL");
     let address = address.trim_end_matches('/');
     let stream = TcpStream::connect(address).expect("the server listens");
+    stream.set_read_timeout(Some(TIMEOUT)).expect("a timeout");
     let (mut socket, _) = tungstenite::client(format!("ws://{address}/ws"), stream).expect("a WebSocket");
     for message in [
         json!({"type": "hello", "protocols": [3, 4], "capabilities": ["subscribe", "robot"]}),
@@ -67,7 +81,9 @@ fn robot_of_run() -> Robot {
         socket.send(Message::text(message.to_string())).expect("the server reads");
     }
     let (mut description, mut states) = (None, Vec::<Value>::new());
+    let began = Instant::now();
     while states.len() < 2 {
+        assert!(began.elapsed() < TIMEOUT, "the robot has not moved within {TIMEOUT:?}");
         let Message::Text(text) = socket.read().expect("the server sends") else { continue };
         let message: Value = serde_json::from_str(&text).expect("JSON");
         match message["type"].as_str() {
@@ -78,8 +94,6 @@ fn robot_of_run() -> Robot {
             _ => {}
         }
     }
-    run.kill().expect("our own child");
-    run.wait().expect("our own child");
     Robot { description: description.expect("a robot comes before its states"), states }
 }
 

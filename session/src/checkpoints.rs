@@ -11,7 +11,7 @@ use std::sync::Arc;
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 use trainer::checkpoint::{Checkpoint, PendingCheckpoint};
-use trainer::{Edits, Method};
+use trainer::{Edits, Method, ModelKind};
 
 /// Default time between two checkpoints.
 const DEFAULT_PERIOD: Duration = Duration::from_secs(60);
@@ -50,11 +50,17 @@ pub fn parse_period(text: &str) -> Result<Duration, String> {
     secs.ok_or_else(|| "expected a number of at least 0".to_owned())
 }
 
-/// Reads the checkpoint in a run folder.
+/// Reads the checkpoint in a run folder. If the folder also contains the complete model, the edits are those saved with
+/// it, which operators may have changed after the end of the run.
 pub fn read(folder: &Path) -> crate::Result<Checkpoint> {
     expect_one_model(folder)?;
-    Checkpoint::read(&folder.join(CHECKPOINT))
-        .with_context(|| format!("no checkpoint to resume from in {}", folder.display()))
+    let mut checkpoint = Checkpoint::read(&folder.join(CHECKPOINT))
+        .with_context(|| format!("no checkpoint to resume from in {}", folder.display()))?;
+    let last_file = ModelKind::from_name(&checkpoint.method).and_then(|kind| kind.entry().files.last());
+    if last_file.is_some_and(|file| folder.join(file).is_file()) {
+        checkpoint.edits = Edits::read(folder)?;
+    }
+    Ok(checkpoint)
 }
 
 /// Rejects a limit in seconds that earlier training has already reached.
@@ -275,6 +281,8 @@ impl CheckpointWrite {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use trainer::Aabb;
+    use trainer::edits::Edit;
 
     #[test]
     fn checkpoint_period_must_be_a_number() {
@@ -293,6 +301,40 @@ mod tests {
         assert_eq!(none.or_previous(&flags(two)).period, two.period);
         assert_eq!(one.or_previous(&flags(two)).period, one.period);
         assert_eq!(none.or_previous(&flags(none)).period, None);
+    }
+
+    #[test]
+    fn edits_saved_with_the_model_replace_those_of_the_checkpoint() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let folder = folder.path();
+        let kind = ModelKind::from_name("tsdf").expect("a method");
+        let edits_of = |n: usize| {
+            let aabb = Aabb { world_from_box: kinematics::Transform::identity(), min_m: [0.0; 3], max_m: [1.0; 3] };
+            let mut edits = Edits::default();
+            (0..n).for_each(|_| edits.push(Edit::Box(aabb)).expect("few edits"));
+            edits
+        };
+        let checkpoint = Checkpoint {
+            method: kind.name().to_owned(),
+            seconds: 1.0,
+            depth_from: None,
+            flags: BTreeMap::new(),
+            is_finished: false,
+            edits: edits_of(1),
+            state: serde_json::Value::Null,
+            arrays: Vec::new(),
+        };
+        checkpoint.write(&folder.join(CHECKPOINT)).expect("written");
+        let n_edits = || read(folder).expect("a checkpoint").edits.len();
+        edits_of(2).write(folder).expect("written");
+        assert_eq!(n_edits(), 1, "the model is not saved yet");
+        let files = kind.entry().files;
+        std::fs::write(folder.join(files[0]), "").expect("written");
+        assert_eq!(n_edits(), 1, "the model is incomplete");
+        std::fs::write(folder.join(files[files.len() - 1]), "").expect("written");
+        assert_eq!(n_edits(), 2);
+        edits_of(0).write(folder).expect("written");
+        assert_eq!(n_edits(), 0, "all edits were undone");
     }
 
     #[test]

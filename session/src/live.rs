@@ -1,6 +1,7 @@
 //! The loop of a live run: takes keyframes, trains models, and draws pictures for viewers.
 
 use crate::chunk_publisher::ChunkPublisher;
+use crate::editing::Editor;
 use crate::ledger::{KeyframeTimes, Ledger};
 use crate::observations::{ModelState, ObservationPublisher, PosedKeyframe};
 use crate::recoveries::{self, OpenGpu, Recoveries};
@@ -13,7 +14,7 @@ use keyframe::{Keyframe, Split};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use trainer::{AlignTiming, QueuedPicture, RenderRequest};
-use viz::{Control, Hub, KeyframePose, ModelStatus, PendingRender, Status};
+use viz::{Control, EditRequest, Hub, KeyframePose, ModelStatus, PendingRender, Status};
 
 /// Minimum number of keyframes that determine the first view of the scene.
 const HINT_KEYFRAMES: usize = 5;
@@ -81,8 +82,11 @@ pub struct Live {
     is_paused: bool,
     /// Result of the last checkpoint that an operator requested.
     checkpoint_note: Option<String>,
+    editor: Editor,
     /// What the last edit did.
     edit_note: Option<String>,
+    /// Number of times that edits of any model have changed.
+    edit_revision: u64,
     chunk_publisher: ChunkPublisher,
     observation_publisher: ObservationPublisher,
 }
@@ -117,7 +121,9 @@ impl Live {
             keyframe_change: None,
             is_paused: false,
             checkpoint_note: None,
+            editor: Editor::default(),
             edit_note: None,
+            edit_revision: 0,
         }
     }
 
@@ -275,21 +281,38 @@ impl Live {
         }
     }
 
-    /// Applies the edits that operators have requested.
+    /// Erases the floaters that were found, and applies the edits that operators have requested.
     fn apply_edits(&mut self) {
+        self.erase_found(false);
         for request in self.hub.take_edits() {
-            let Some(session_ix) = session_for_method(&self.sessions, request.method()) else {
-                let reason = self.unknown_method(request.method());
-                self.hub.reject_edit(&request, &reason);
-                continue;
+            let edited = match session_for_method(&self.sessions, request.method()) {
+                Some(session_ix) => self.sessions[session_ix].edit(&mut self.editor, &request),
+                None => Err(self.unknown_method(request.method())),
             };
-            match self.sessions[session_ix].edit(request.action()) {
-                Ok(note) => {
-                    self.edit_note = Some(note);
-                    self.published = None; // Viewers wait for the new status.
+            self.report_edit(&request, edited);
+        }
+    }
+
+    /// Erases floaters once they are found, or waits for them if `wait`. Returns whether a search has ended.
+    fn erase_found(&mut self, wait: bool) -> bool {
+        let Some((request, found)) = self.editor.take_found(wait) else { return false };
+        let session_ix = session_for_method(&self.sessions, request.method()).unwrap_or_default();
+        let erased = found.and_then(|floaters| self.sessions[session_ix].erase_floaters(floaters));
+        self.report_edit(&request, erased.map(Some));
+        true
+    }
+
+    /// Shows the note on an edit, or sends the reason why it was not possible.
+    fn report_edit(&mut self, request: &EditRequest, edited: Result<Option<String>, String>) {
+        match edited {
+            Ok(note) => {
+                if note.is_some() {
+                    self.edit_note = note;
+                    self.edit_revision += 1;
                 }
-                Err(error) => self.hub.reject_edit(&request, &error.to_string()),
+                self.published = None; // Viewers wait for the new status.
             }
+            Err(reason) => self.hub.reject_edit(request, &reason),
         }
     }
 
@@ -560,31 +583,41 @@ impl Live {
             self.budget.add_training(before.elapsed());
             self.publish_moved_keyframes();
         }
+        self.publish_status();
+        Ok(())
+    }
+
+    fn publish_status(&self) {
+        let own_notes = [self.checkpoint_note.clone(), self.edit_note.clone(), self.editor.note()];
         let movements = self.sessions[0].alignment().map_or(&[][..], |alignment| &alignment.movements[..]);
         let mut models = self.sessions.iter().map(model_status);
         self.hub.set_status(Status {
             state: self.state().to_owned(),
-            seconds: clock_secs,
+            seconds: self.sessions[0].secs(),
             keyframes: self.keyframes.len() as u64,
             rejected: self.feed.rejected(),
             model: models.next().unwrap_or_default(),
             others: models.collect(),
+            edit_revision: self.edit_revision,
             notes: [
                 self.notes.clone(),
                 self.device_notes.list(),
                 movements.iter().map(ToString::to_string).collect(),
-                [&self.checkpoint_note, &self.edit_note].into_iter().flatten().cloned().collect(),
+                own_notes.into_iter().flatten().collect(),
             ]
             .concat(),
             ..Status::default()
         });
-        Ok(())
     }
 
-    /// Ends the input. Returns the sessions and the results of the input.
-    pub fn finish(self) -> (Vec<Session>, crate::Result<InputResult>) {
+    /// Ends the input and a search for floaters. Returns the sessions and the results of the input.
+    pub fn finish(mut self) -> (Vec<Session>, crate::Result<InputResult>) {
         // Changes only the state; the rest of the status stays visible until the scores are published.
         self.hub.set_state("saving");
+        if self.erase_found(true) {
+            self.publish_status();
+            self.hub.set_state("saving");
+        }
         (self.sessions, self.feed.finish().map_err(Into::into))
     }
 

@@ -17,11 +17,12 @@ use crate::checkpoints::{Checkpoints, Snapshot};
 use crate::chunk_publisher::ChunkPublisher;
 use crate::clock::Clock;
 use crate::decisions::DecisionLog;
+use crate::editing::{self, Editor};
 use crate::evaluate::Evaluator;
+use crate::gpu_loss;
 use crate::next_commands::DataSource;
 use crate::observer::{Evaluation, Observer};
 use crate::recovery::Recovery;
-use crate::{editing, gpu_loss};
 use calibration::{Alignment, CalibratedCamera, CameraCorrection};
 use capture::Stop;
 use keyframe::Keyframe;
@@ -32,12 +33,13 @@ use scoreboard::Scoreboard;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
+use trainer::edits::Floaters;
 use trainer::gpu::Gpu;
 use trainer::{
     Edits, FailedModel, Method, ModelKind, Packing, Picture, Progress, QueuedPicture, RenderRequest, Rendered,
 };
 use training_time::TrainingTime;
-use viz::EditAction;
+use viz::EditRequest;
 
 /// Approximate duration of a slice. The device is idle for a moment at the end of each slice.
 const TIME_SLICE: Duration = Duration::from_millis(40);
@@ -244,9 +246,14 @@ impl Session {
         &self.edits
     }
 
-    /// Changes the edits. Returns a note on what was done.
-    pub(crate) fn edit(&mut self, action: &EditAction) -> Result<String, trainer::Error> {
-        editing::apply(action, &mut self.edits, self.method.as_mut())
+    /// Changes the edits; see [`Editor::apply`].
+    pub(crate) fn edit(&mut self, editor: &mut Editor, request: &EditRequest) -> Result<Option<String>, String> {
+        editor.apply(request, request.action(), &mut self.edits, self.method.as_mut())
+    }
+
+    /// Erases floaters; see [`editing::erase_floaters`].
+    pub(crate) fn erase_floaters(&mut self, floaters: Floaters) -> Result<String, String> {
+        editing::erase_floaters(&mut self.edits, floaters)
     }
 
     /// Waits for queued work and returns the total number of updates, including those of trials.

@@ -1,7 +1,7 @@
 //! Draws trained models for viewers: the loop of `view`, and of a run after its training.
 
 use crate::chunk_publisher::ChunkPublisher;
-use crate::editing;
+use crate::editing::{self, Editor};
 use crate::observations::{ModelState, ObservationPublisher, PosedKeyframe};
 use capture::Stop;
 use kinematics::Transform;
@@ -37,8 +37,10 @@ pub struct ModelViewer {
     observation_publisher: ObservationPublisher,
     /// Pose of the page's world, which is z up, in the model's world.
     model_from_page: Transform,
+    editor: Editor,
     /// What the last edit or save did.
     note: Option<String>,
+    published_notes: Vec<String>,
 }
 
 impl ModelViewer {
@@ -52,7 +54,9 @@ impl ModelViewer {
             observation_publisher: ObservationPublisher::new(hub.clone()),
             hub,
             model_from_page: Transform::identity(),
+            editor: Editor::default(),
             note: None,
+            published_notes: Vec::new(),
         }
     }
 
@@ -96,55 +100,71 @@ impl ModelViewer {
 
     /// Applies the edits that operators have requested, and saves them if this is requested.
     fn apply_edits(&mut self) {
+        if let Some((request, found)) = self.editor.take_found(false) {
+            let erased = found.and_then(|floaters| {
+                let model = model_mut(&mut self.models, request.method())?;
+                editing::erase_floaters(&mut model.edits, floaters)
+            });
+            self.report_edit(&request, erased.map(Some));
+        }
         for request in self.hub.take_edits() {
-            match self.edit(&request) {
-                Ok(note) => self.publish_edits(note),
-                Err(reason) => self.hub.reject_edit(&request, &reason),
-            }
+            let edited = self.edit(&request);
+            self.report_edit(&request, edited);
         }
         if self.hub.take_controls().contains(&Control::Save) {
             let notes = self.models.iter_mut().map(ServedModel::save_edits).collect::<Vec<_>>();
-            self.publish_edits(notes.join("; "));
+            self.note = Some(notes.join("; "));
+            self.publish_notes();
         }
     }
 
-    /// Makes an edit. Returns a note on what was done, or the reason why it was not possible.
-    fn edit(&mut self, request: &EditRequest) -> Result<String, String> {
-        let model_from_page = self.model_from_page;
-        let model = self.model_mut(request.method())?;
+    /// Makes an edit; see [`Editor::apply`].
+    fn edit(&mut self, request: &EditRequest) -> Result<Option<String>, String> {
+        let model = model_mut(&mut self.models, request.method())?;
         let action = match *request.action() {
-            EditAction::Erase(aabb) => EditAction::Erase(box_in_model(aabb, &model_from_page)),
+            EditAction::Erase(aabb) => EditAction::Erase(box_in_model(aabb, &self.model_from_page)),
             action => action,
         };
-        editing::apply(&action, &mut model.edits, model.method.as_mut()).map_err(|error| error.to_string())
+        self.editor.apply(request, &action, &mut model.edits, model.method.as_mut())
     }
 
-    /// Publishes the numbers of edits and a note.
-    fn publish_edits(&mut self, note: String) {
-        let previous = self.note.replace(note.clone());
-        self.hub.change_status(|Status { model, others, notes, .. }| {
+    /// Publishes the result of an edit, or sends the reason why it was not possible.
+    fn report_edit(&mut self, request: &EditRequest, edited: Result<Option<String>, String>) {
+        match edited {
+            Ok(None) => {}
+            Ok(Some(note)) => {
+                self.publish_edits();
+                self.note = Some(note);
+            }
+            Err(reason) => self.hub.reject_edit(request, &reason),
+        }
+        self.publish_notes();
+    }
+
+    /// Publishes the numbers of edits.
+    fn publish_edits(&self) {
+        self.hub.change_status(|Status { model, others, edit_revision, .. }| {
             for ModelStatus { method, edits, .. } in std::iter::once(model).chain(others) {
                 let model = self.models.iter().find(|model| model.kind.name() == method);
                 *edits = model.map_or(0, |model| model.edits.len());
             }
-            notes.retain(|shown| Some(shown) != previous.as_ref());
-            notes.push(note);
+            *edit_revision += 1;
         });
     }
 
-    /// The model of this method; the first one if no method is given.
-    fn model_mut(&mut self, method: Option<&str>) -> Result<&mut ServedModel, String> {
-        let names = self.models.iter().map(|model| model.kind.name()).collect::<Vec<_>>().join(" or ");
-        let is_requested = |model: &&mut ServedModel| method.is_none_or(|name| model.kind.name() == name);
-        self.models
-            .iter_mut()
-            .find(is_requested)
-            .ok_or_else(|| format!("no model with the method {:?}; use {names}", method.unwrap_or_default()))
+    /// Publishes the notes on edits in place of the previous ones.
+    fn publish_notes(&mut self) {
+        let current: Vec<String> = self.note.iter().cloned().chain(self.editor.note()).collect();
+        let previous = std::mem::replace(&mut self.published_notes, current.clone());
+        self.hub.change_status(|Status { notes, .. }| {
+            notes.retain(|shown| !previous.contains(shown));
+            notes.extend(current);
+        });
     }
 
     fn answer(&mut self, pending: PendingRender) {
         let request = in_model(&pending.request, &self.model_from_page);
-        let model = match self.model_mut(pending.method()) {
+        let model = match model_mut(&mut self.models, pending.method()) {
             Ok(model) => model,
             Err(reason) => return pending.fail(&reason),
         };
@@ -173,6 +193,16 @@ impl ServedModel {
             Err(error) => format!("cannot save the edits: {:#}", crate::Error::from(error)),
         }
     }
+}
+
+/// The model of this method; the first one if no method is given.
+fn model_mut<'a>(models: &'a mut [ServedModel], method: Option<&str>) -> Result<&'a mut ServedModel, String> {
+    let names = models.iter().map(|model| model.kind.name()).collect::<Vec<_>>().join(" or ");
+    let is_requested = |model: &&mut ServedModel| method.is_none_or(|name| model.kind.name() == name);
+    models
+        .iter_mut()
+        .find(is_requested)
+        .ok_or_else(|| format!("no model with the method {:?}; use {names}", method.unwrap_or_default()))
 }
 
 /// Transforms a box from the page's world frame to the model's world frame.

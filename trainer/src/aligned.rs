@@ -7,7 +7,7 @@
 //! keyframes; the model moves along with them or restarts, see [`Recalibrate`].
 
 use crate::checkpoint::{Checkpoint, PendingCheckpoint};
-use crate::edits::{Edits, Floaters};
+use crate::edits::{Edits, PendingFloaters};
 use crate::gpu::{Gpu, PassTiming};
 use crate::model_chunks::PendingChunks;
 use crate::model_metadata::{METADATA_FILE, read_metadata};
@@ -453,7 +453,7 @@ impl<M: Recalibrate + 'static> Method for Aligned<M> {
         self.model.queue_chunks(only_changed, edits)
     }
 
-    fn find_floaters(&mut self, edits: &Edits) -> Result<Floaters, Error> {
+    fn find_floaters(&mut self, edits: &Arc<Edits>) -> Result<PendingFloaters, Error> {
         self.model.find_floaters(edits)
     }
 

@@ -2,7 +2,7 @@
 
 use crate::bounds::Bounds;
 use crate::checkpoint::PendingCheckpoint;
-use crate::edits::{Edits, Floaters};
+use crate::edits::{Edits, PendingFloaters};
 use crate::gpu::PassTiming;
 use crate::model_chunks::PendingChunks;
 use crate::{Error, Packing, Picture, QueuedPicture, RenderRequest, Rendered};
@@ -82,13 +82,14 @@ pub trait Method {
     fn queue_chunks(&mut self, _only_changed: bool, _edits: &Arc<Edits>) -> Result<Option<PendingChunks>, Error> {
         Ok(None)
     }
-    /// Finds small parts that are not connected to the large parts of the model. Space that is already erased is
-    /// ignored. Waits for queued work and does not change the model.
+    /// Starts to search for small parts that are not connected to the large parts of the model. Space that is already
+    /// erased is ignored. Later training does not affect the result. The search, which may take seconds, takes place in
+    /// [`PendingFloaters::finish`]; it fails if there are no floaters.
     ///
     /// # Errors
     ///
-    /// Fails if there are none, or if the model does not support this.
-    fn find_floaters(&mut self, _edits: &Edits) -> Result<Floaters, Error> {
+    /// Fails if the model does not support this.
+    fn find_floaters(&mut self, _edits: &Arc<Edits>) -> Result<PendingFloaters, Error> {
         Err(Error::CannotFindFloaters)
     }
     /// PSNR of the requested picture against a keyframe's image of the same size, dB, computed on the GPU.

@@ -38,6 +38,11 @@ impl EditRequest {
         Ok(Self { client, id: message.id, method: message.method.clone(), action })
     }
 
+    /// A request for the first model, with no client that waits for it.
+    pub fn of_nobody(action: EditAction) -> Self {
+        Self { client: 0, id: None, method: None, action }
+    }
+
     /// The model to edit; the first if `None`. The name comes from the client and may not exist.
     pub fn method(&self) -> Option<&str> {
         self.method.as_deref()

@@ -13,6 +13,10 @@ use trainer::Rendered;
 /// Maximum number of pictures per client that are being rendered or sent. It limits rendering for slow clients.
 const MAX_UNSENT: usize = 2;
 
+/// Maximum number of results that wait to be sent to a client. A client that does not read misses the reasons of further
+/// failed edits.
+const MAX_OUTBOX: usize = 64;
+
 /// Maximum number of views per client.
 pub(crate) const MAX_VIEWS: usize = 8;
 
@@ -149,9 +153,14 @@ impl Queue {
         }
     }
 
-    /// Puts a result into a client's outbox and wakes the client's session.
+    /// Puts a result into a client's outbox and wakes the client's session. Drops the reason of a failed edit if the
+    /// outbox is full; the number of the other results is limited by [`MAX_UNSENT`].
     pub(crate) fn push_outgoing(&mut self, client: u64, outgoing: Outgoing) {
         if let Some(waiting) = self.clients.get_mut(&client) {
+            if waiting.outbox.len() >= MAX_OUTBOX && matches!(outgoing, Outgoing::Rejected { .. }) {
+                log::debug!("client {client} does not read: a failed edit is not reported");
+                return;
+            }
             waiting.outbox.push_back(outgoing);
             waiting.wake.notify_one();
         }
@@ -216,7 +225,7 @@ fn n_px_of_last_stage(view_request: &ViewRequest) -> f64 {
 
 #[cfg(test)]
 mod tests {
-    use super::Queue;
+    use super::{MAX_OUTBOX, Outgoing, Queue};
     use crate::protocol::RenderMessage;
     use crate::view_request::ViewRequest;
 
@@ -314,6 +323,21 @@ mod tests {
             [0.1, 0.5, 1.0]
         );
         assert_eq!(draw(&mut queue, 8, 1.0, |view_request| view_request.method = Some("nerf".to_owned())), [1.0]);
+    }
+
+    #[test]
+    fn client_that_does_not_read_gets_a_limited_number_of_results() {
+        let mut queue = Queue::default();
+        let (a, _) = queue.join();
+        let rejected = |id| Outgoing::Rejected { id: Some(id), reason: String::new() };
+        (0..1000).for_each(|id| queue.push_outgoing(a, rejected(id)));
+        queue.push_outgoing(a, Outgoing::Failed { id: 5, view: "".into(), reason: String::new() });
+        let sent: Vec<Outgoing> = std::iter::from_fn(|| queue.collect(a)).collect();
+        assert_eq!(sent.len(), MAX_OUTBOX + 1);
+        assert!(matches!(sent[63], Outgoing::Rejected { id: Some(63), .. }), "the oldest are kept: {:?}", sent[63]);
+        assert!(matches!(sent[64], Outgoing::Failed { .. }), "pictures are never dropped: {:?}", sent[64]);
+        queue.push_outgoing(a, rejected(7));
+        assert!(queue.collect(a).is_some(), "there is room again");
     }
 
     #[test]

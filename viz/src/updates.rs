@@ -25,6 +25,8 @@ pub struct Status {
     pub model: ModelStatus,
     /// The models trained in parallel with it; empty if there is only one.
     pub others: Vec<ModelStatus>,
+    /// Changes whenever the edits of a model change, even if their number does not.
+    pub edit_revision: u64,
     /// Messages that the operator should read, for example that a camera disconnected.
     pub notes: Vec<String>,
     /// The result, once the run has ended and its model is saved.

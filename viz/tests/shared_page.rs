@@ -146,6 +146,13 @@ fn edit_model(browser: &mut Browser, hub: &Hub) {
     set_edits(2);
     wait_for(browser, "the number of edits", |browser| browser.text("undo-edit") == "Undo (2)");
     assert_eq!(browser.text("edit-note"), "");
+
+    press(browser, "a");
+    assert_eq!(browser.text("edit-note"), "looking for floaters …");
+    wait_for_edits(browser, hub);
+    // An undo and another edit: only the revision differs.
+    hub.change_status(|status| status.edit_revision += 2);
+    wait_for(browser, "the change", |browser| browser.text("edit-note").is_empty());
 }
 
 /// Serves one HTML document to every request, as another site.

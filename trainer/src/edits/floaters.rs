@@ -1,8 +1,8 @@
 //! Finds floaters: small parts of a model that are not connected to its large parts.
 
-use super::cells::{CellGrid, CellSet};
+use super::cells::{CellGrid, CellMask, CellSet};
 use super::groups::Groups;
-use std::collections::{BTreeMap, BTreeSet};
+use crate::pending::Pending;
 
 /// A part with less than this fraction (1 / divisor) of the cells or triangles of the whole is a floater.
 ///
@@ -26,42 +26,53 @@ pub struct Floaters {
     pub item: &'static str,
 }
 
+/// A search for floaters.
+pub type PendingFloaters = Pending<Floaters>;
+
 /// Cells that contain parts of the model, by whether the part is a floater.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub(crate) struct CellLabels {
     /// Cells of large parts.
-    pub(crate) kept: BTreeSet<u32>,
+    pub(crate) kept: CellMask,
     /// Cells of floaters.
-    pub(crate) floating: BTreeSet<u32>,
+    pub(crate) floating: CellMask,
 }
 
 impl CellLabels {
+    /// No cell contains a part of the model.
+    pub(crate) fn none(grid: &CellGrid) -> Self {
+        Self { kept: CellMask::none(grid), floating: CellMask::none(grid) }
+    }
+
     /// Divides occupied cells into groups, after connecting adjacent ones. Groups with few cells are floaters.
-    pub(crate) fn of_occupied(grid: &CellGrid, occupied: &BTreeSet<u32>, mut groups: Groups) -> Self {
-        for cell in occupied {
-            grid.neighbors(*cell).filter(|other| occupied.contains(other)).for_each(|other| groups.join(*cell, other));
+    pub(crate) fn of_occupied(grid: &CellGrid, occupied: &CellMask, mut groups: Groups) -> Self {
+        for cell in occupied.cells() {
+            grid.neighbors(cell).filter(|other| occupied.contains(*other)).for_each(|other| groups.join(cell, other));
         }
-        let mut sizes: BTreeMap<u32, usize> = BTreeMap::new();
-        for cell in occupied {
-            *sizes.entry(groups.representative(*cell)).or_default() += 1;
+        let mut sizes = vec![0; grid.n()];
+        for cell in occupied.cells() {
+            sizes[groups.representative(cell) as usize] += 1;
         }
-        let (floating, kept) =
-            occupied.iter().partition(|cell| is_floater_size(sizes[&groups.representative(**cell)], occupied.len()));
-        Self { kept, floating }
+        let (mut labels, n_occupied) = (Self::none(grid), occupied.n_marked());
+        for cell in occupied.cells() {
+            let is_floating = is_floater_size(sizes[groups.representative(cell) as usize], n_occupied);
+            if is_floating { &mut labels.floating } else { &mut labels.kept }.insert(cell);
+        }
+        labels
     }
 
     /// Also keeps the cells around those of large parts.
     pub(crate) fn keep_around(&mut self, grid: &CellGrid) {
-        let around: Vec<u32> = self.kept.iter().flat_map(|cell| grid.neighbors(*cell)).collect();
-        self.kept.extend(around);
+        let inner = self.kept.clone();
+        self.kept.extend(inner.cells().flat_map(|cell| grid.neighbors(cell)));
     }
 
     /// The cells to erase: those of floaters and, because floaters move in training, the cells around them, except for
     /// kept cells. `None` if there are none.
     pub(crate) fn erased(&self, grid: &CellGrid) -> Option<CellSet> {
-        let around = self.floating.iter().flat_map(|cell| grid.neighbors(*cell));
-        let cells = self.floating.iter().copied().chain(around).filter(|cell| !self.kept.contains(cell));
-        let cells: BTreeSet<u32> = cells.collect();
-        (!cells.is_empty()).then(|| CellSet::new(*grid, &cells))
+        let mut erased = self.floating.clone();
+        erased.extend(self.floating.cells().flat_map(|cell| grid.neighbors(cell)));
+        let mut cells = erased.cells().filter(|cell| !self.kept.contains(*cell)).peekable();
+        cells.peek().is_some().then(|| CellSet::new(*grid, cells))
     }
 }

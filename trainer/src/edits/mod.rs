@@ -8,9 +8,10 @@ mod floaters;
 mod groups;
 mod stored;
 
+pub(crate) use cells::CellMask;
 pub use cells::{CellGrid, CellSet};
-pub use floaters::Floaters;
 pub(crate) use floaters::{CellLabels, is_floater_size};
+pub use floaters::{Floaters, PendingFloaters};
 pub(crate) use groups::Groups;
 
 use crate::{Aabb, Error};

@@ -1,6 +1,6 @@
 //! Tests of edits as data; the tests of each method draw them.
 
-use super::{CellGrid, CellLabels, CellSet, Edit, Edits, Groups, MAX_EDITS};
+use super::{CellGrid, CellLabels, CellMask, CellSet, Edit, Edits, Groups, MAX_EDITS};
 use crate::{Aabb, Error};
 use kinematics::Transform;
 use nalgebra::Vector3;
@@ -49,7 +49,10 @@ fn cells_cover_all_space() {
     assert_eq!(GRID.neighbors(corner).collect::<BTreeSet<_>>(), BTreeSet::from([1, 40, 41, 1600, 1601, 1640, 1641]));
     assert_eq!(GRID.neighbors(GRID.cell_at([1.01, 0.01, -1.99])).count(), 26);
     let cells = BTreeSet::from([3, 4, 5, 9, 11, corner]);
-    let set = CellSet::new(GRID, &cells);
+    let mut mask = CellMask::none(&GRID);
+    mask.extend(cells.iter().rev().copied());
+    assert!(mask.cells().eq(cells.iter().copied()) && mask.contains(11) && !mask.contains(10));
+    let set = CellSet::new(GRID, cells);
     assert_eq!(set.ranges, [[0, 1], [3, 6], [9, 10], [11, 12]]);
 }
 
@@ -57,10 +60,11 @@ fn cells_cover_all_space() {
 fn small_groups_of_cells_are_floaters() {
     // A plate of 30 x 30 cells, two cells above it, and one that touches a corner of the plate.
     let cell = |x: u32, y: u32, z: u32| x + 40 * (y + 40 * z);
-    let mut occupied: BTreeSet<u32> = (5..35).flat_map(|x| (5..35).map(move |y| cell(x, y, 10))).collect();
+    let mut occupied = CellMask::none(&GRID);
+    occupied.extend((5..35).flat_map(|x| (5..35).map(move |y| cell(x, y, 10))));
     occupied.extend([cell(4, 4, 11), cell(20, 20, 14)]);
     let labels = CellLabels::of_occupied(&GRID, &occupied, Groups::new(GRID.n()));
-    assert_eq!((labels.floating.len(), labels.kept.len()), (1, 901));
+    assert_eq!((labels.floating.n_marked(), labels.kept.n_marked()), (1, 901));
     let erased = labels.erased(&GRID).unwrap();
     let n_erased: u32 = erased.ranges.iter().map(|[first, end]| end - first).sum();
     assert_eq!(n_erased, 27, "the floater and the cells around it");
@@ -79,7 +83,7 @@ fn files_round_trip() {
     let mut edits = Edits::default();
     let aabb = Aabb { world_from_box: Transform::translation(0.1, 0.2, 0.3), ..rotated_box() };
     edits.push(Edit::Box(aabb)).unwrap();
-    edits.push(Edit::Cells(CellSet::new(GRID, &BTreeSet::from([7, 8, 100])))).unwrap();
+    edits.push(Edit::Cells(CellSet::new(GRID, [7, 8, 100]))).unwrap();
     edits.write(folder.path()).unwrap();
     assert!(Edits::read(folder.path()).unwrap() == edits);
     Edits::default().write(folder.path()).unwrap();

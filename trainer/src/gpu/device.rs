@@ -514,7 +514,7 @@ impl PendingRead {
 /// Memory on the GPU; freed on drop, once the GPU is done with it.
 #[derive(Debug)]
 pub struct Buffer {
-    pub(super) id: u64,
+    pub(crate) id: u64,
     pub(super) raw: wgpu::Buffer,
     bytes: u64,
     label: Arc<str>,

@@ -655,5 +655,5 @@ fn erased_object_is_not_drawn() {
     assert!(n_farther > 300, "{n_farther} pixels show the far side");
     let undone = model.render(&request).unwrap();
     assert!(undone.rgba_srgb == whole.rgba_srgb && undone.depth_m == whole.depth_m, "after an undo");
-    assert!(matches!(model.find_floaters(&Edits::default()), Err(Error::CannotFindFloaters)));
+    assert!(matches!(model.find_floaters(&Arc::default()), Err(Error::CannotFindFloaters)));
 }

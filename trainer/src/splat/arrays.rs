@@ -6,6 +6,8 @@ use rayon::prelude::*;
 
 /// Maximum number of color coefficients per splat (degree 3).
 const MAX_COEFFICIENTS: usize = 16;
+/// Splats that are more transparent are not drawn, see shared/projection.wgsl.
+const MIN_ALPHA: f64 = 1.0 / 255.0;
 
 /// A cloud of splats in the world frame: raw optimized values, one entry per splat.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -65,6 +67,21 @@ impl SplatArrays {
     /// Number of color coefficients of one splat: 1, 4, 9 or 16.
     pub fn n_coefficients(&self) -> usize {
         (self.sh_degree as usize + 1).pow(2)
+    }
+
+    /// Opacity of a splat, 0 to 1.
+    pub(crate) fn opacity(&self, splat_ix: usize) -> f64 {
+        1.0 / (1.0 + (-f64::from(self.opacity_logits[splat_ix])).exp())
+    }
+
+    /// Indices of the splats that are drawn. Splats with values that are not finite are not.
+    pub(crate) fn visible(&self) -> Vec<u32> {
+        let is_finite = |ix: usize| {
+            let shape = self.means[ix].iter().chain(&self.log_scales[ix]).chain(&self.rotations_wxyz[ix]);
+            shape.chain(&self.sh[ix * self.n_coefficients()]).all(|value| value.is_finite())
+        };
+        let is_visible = |ix: &u32| self.opacity(*ix as usize) > MIN_ALPHA && is_finite(*ix as usize);
+        (0..u32::try_from(self.n_splats()).unwrap_or(u32::MAX)).filter(is_visible).collect()
     }
 
     /// The splats for which `is_kept` is true of the index.

@@ -7,10 +7,9 @@
 use super::arrays::SplatArrays;
 use super::bounds::bounds;
 use crate::Bounds;
-use crate::edits::{CellGrid, CellLabels, Floaters, Groups};
+use crate::edits::{CellGrid, CellLabels, CellMask, Floaters, Groups};
 use crate::gpu::f32_of;
 use nalgebra::{Quaternion, UnitQuaternion, Vector3};
-use std::collections::BTreeSet;
 
 /// Cells along an axis: cells within the radius of the scene are 2 % of it wide.
 const N_CELLS: u32 = 200;
@@ -21,29 +20,25 @@ const REACH: f64 = 2.0;
 /// Maximum number of sampled points of one splat, and of all splats: some seconds on one core.
 const MAX_SAMPLES: f64 = 16_384.0;
 const MAX_TOTAL_SAMPLES: f64 = 5e7;
-/// Splats that are more transparent are not drawn, see shared/projection.wgsl.
-const MIN_ALPHA: f64 = 1.0 / 255.0;
 
 /// The small parts of a splat model; `None` if there are none.
 pub(super) fn floaters(splats: &SplatArrays) -> Option<Floaters> {
     let Bounds { center_m, radius_m } = bounds(splats)?;
     let grid = CellGrid { center_m, radius_m, n_cells: N_CELLS };
-    let is_visible = |ix: &usize| opacity(splats, *ix) > MIN_ALPHA && is_finite(splats, *ix);
-    let visible: Vec<usize> = (0..splats.n_splats()).filter(is_visible).collect();
+    let visible: Vec<usize> = splats.visible().into_iter().map(|ix| ix as usize).collect();
     let (occupied, connected) = occupied(splats, &visible, &grid);
     let mut labels = CellLabels::of_occupied(&grid, &occupied, connected);
     labels.keep_around(&grid);
     let mean_m = |ix: usize| splats.means[ix].map(f64::from);
     let cells = visible.iter().map(|ix| grid.cell_at(mean_m(*ix)));
-    let faint: BTreeSet<u32> = cells.filter(|cell| !labels.kept.contains(cell)).collect();
-    labels.floating.extend(faint);
+    labels.floating.extend(cells.filter(|cell| !labels.kept.contains(*cell)));
     let cells = labels.erased(&grid)?;
     let n_erased = visible.iter().filter(|ix| cells.contains(mean_m(**ix))).count() as u64;
     (n_erased > 0).then_some(Floaters { cells, n_erased, item: "splat" })
 }
 
 /// The occupied cells, and the cells that opaque splats connect: large splats cover cells between their points, too.
-fn occupied(splats: &SplatArrays, visible: &[usize], grid: &CellGrid) -> (BTreeSet<u32>, Groups) {
+fn occupied(splats: &SplatArrays, visible: &[usize], grid: &CellGrid) -> (CellMask, Groups) {
     let steps: Vec<[f64; 3]> = visible.iter().map(|ix| n_steps(splats, *ix, grid)).collect();
     let total = |max: f64| steps.iter().map(|steps| n_samples(steps).min(max)).sum::<f64>();
     let mut max_samples = MAX_SAMPLES;
@@ -55,7 +50,7 @@ fn occupied(splats: &SplatArrays, visible: &[usize], grid: &CellGrid) -> (BTreeS
     let mut last_splat = vec![0_u32; grid.n()];
     let mut connected = Groups::new(grid.n());
     for (number, (&ix, steps)) in (1..).zip(visible.iter().zip(&steps)) {
-        let opacity = opacity(splats, ix);
+        let opacity = splats.opacity(ix);
         let center = grid.cell_at(splats.means[ix].map(f64::from));
         for (point_m, falloff) in samples(splats, ix, &limited(steps, max_samples)) {
             let cell = grid.cell_at(point_m);
@@ -68,7 +63,8 @@ fn occupied(splats: &SplatArrays, visible: &[usize], grid: &CellGrid) -> (BTreeS
         }
     }
     let is_occupied = |(_, opacity): &(u32, &f32)| **opacity >= MIN_CELL_OPACITY;
-    let occupied = (0..).zip(&opacities).filter(is_occupied).map(|(cell, _)| cell).collect();
+    let mut occupied = CellMask::none(grid);
+    occupied.extend((0..).zip(&opacities).filter(is_occupied).map(|(cell, _)| cell));
     (occupied, connected)
 }
 
@@ -114,13 +110,4 @@ fn offsets(n_steps: f64) -> Vec<f64> {
     let n = n_steps as u32;
     let both = |step: u32| [1.0, -1.0].map(|sign| sign * REACH * f64::from(step) / n_steps);
     std::iter::once(0.0).chain((1..=n).flat_map(both)).collect()
-}
-
-fn opacity(splats: &SplatArrays, ix: usize) -> f64 {
-    1.0 / (1.0 + (-f64::from(splats.opacity_logits[ix])).exp())
-}
-
-fn is_finite(splats: &SplatArrays, ix: usize) -> bool {
-    let shape = splats.means[ix].iter().chain(&splats.log_scales[ix]).chain(&splats.rotations_wxyz[ix]);
-    shape.clone().all(|value| value.is_finite())
 }

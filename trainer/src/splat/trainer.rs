@@ -36,7 +36,7 @@ use super::schedule::Schedule;
 use super::seed;
 use super::trials::{CountPolicy, SplatTrials, ValidationImage};
 use crate::checkpoint::PendingCheckpoint;
-use crate::edits::{Edits, Floaters};
+use crate::edits::{Edits, PendingFloaters};
 use crate::gpu::{Gpu, PassTiming};
 use crate::model_chunks::PendingChunks;
 use crate::model_metadata::{METADATA_FILE, read_metadata};
@@ -337,9 +337,16 @@ impl Method for SplatTrainer {
         })))
     }
 
-    fn find_floaters(&mut self, edits: &Edits) -> Result<Floaters, Error> {
-        let arrays = displayed(&self.growth_search, &self.trials, &self.model).read(&self.recorder.gpu)?;
-        floaters(&arrays.without_erased(edits)).ok_or(Error::NoFloaters)
+    fn find_floaters(&mut self, edits: &Arc<Edits>) -> Result<PendingFloaters, Error> {
+        let splats = displayed(&self.growth_search, &self.trials, &self.model);
+        if splats.n_splats == 0 {
+            return Err(Error::NoFloaters);
+        }
+        let (gpu, edits) = (Arc::clone(&self.recorder.gpu), Arc::clone(edits));
+        let pending = splats.begin_read(&gpu, 0);
+        Ok(PendingFloaters::new(move || {
+            floaters(&pending.finish(&gpu)?.without_erased(&edits)).ok_or(Error::NoFloaters)
+        }))
     }
 
     fn set_watched(&mut self, watched: bool) {

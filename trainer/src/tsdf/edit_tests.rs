@@ -104,7 +104,7 @@ fn floaters_are_found_and_the_rest_is_kept() {
     let shapes = [scenes::ball(BALL_CENTER), scenes::floor(), floater];
     let mut model = fused_model(options, &scenes::ring(&shapes, BALL_CENTER, 6));
     let whole = model.mesh().unwrap();
-    let found = model.find_floaters(&Edits::default()).unwrap();
+    let found = model.find_floaters(&Arc::default()).unwrap().finish().unwrap();
     let mut edits = Edits::default();
     edits.push(Edit::Cells(found.cells)).unwrap();
     let left = model.mesh_without(&edits).unwrap();
@@ -119,7 +119,7 @@ fn floaters_are_found_and_the_rest_is_kept() {
     // The ball has some small fragments where it was seen at grazing angles.
     assert!(ball(&left) * 100 > ball(&whole) * 98, "{} of {} vertices of the ball", ball(&left), ball(&whole));
     // The erased cells may cut off a few triangles.
-    let n_again = model.find_floaters(&edits).map_or(0, |again| again.n_erased);
+    let n_again = model.find_floaters(&Arc::new(edits)).unwrap().finish().map_or(0, |again| again.n_erased);
     assert!(10 * n_again <= found.n_erased, "{n_again} found again after {}", found.n_erased);
 }
 

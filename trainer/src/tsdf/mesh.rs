@@ -14,7 +14,7 @@ pub(super) use floaters::floaters;
 pub use glb::write as write_glb;
 #[cfg(test)]
 pub(super) use mesher::unit_of;
-pub(super) use mesher::{BlockMesh, Mesher};
+pub(super) use mesher::{BlockMesh, BlockMeshes, Mesher, joined};
 pub use ply::write as write_ply;
 
 #[cfg(test)]

@@ -20,7 +20,7 @@ use super::params::status;
 use super::passes::Canvas;
 use crate::Bounds;
 use crate::checkpoint::PendingCheckpoint;
-use crate::edits::{Edits, Floaters};
+use crate::edits::{Edits, PendingFloaters};
 use crate::gpu::{Gpu, PassTiming, Passes};
 use crate::model_chunks::PendingChunks;
 use crate::model_options::ModelOptions;
@@ -134,7 +134,9 @@ impl TsdfModel {
     /// [`Self::mesh`] without the triangles whose centers are in erased space.
     pub fn mesh_without(&mut self, edits: &Edits) -> Result<Mesh, Error> {
         self.update_mesh()?;
-        Ok(self.voxel_grid().map_or_else(Mesh::default, |voxel_grid| self.meshing.mesh(voxel_grid, edits)))
+        Ok(self
+            .voxel_grid()
+            .map_or_else(Mesh::default, |voxel_grid| mesh::joined(self.meshing.blocks(), voxel_grid, edits)))
     }
 
     /// Meshes the blocks that changed since the last call and reads their triangles back, without joining them into one
@@ -365,10 +367,14 @@ impl Method for TsdfModel {
         Ok(Some(PendingChunks::new(move || Ok(chunks.encode(&voxel_grid)))))
     }
 
-    fn find_floaters(&mut self, edits: &Edits) -> Result<Floaters, Error> {
-        let mesh = self.mesh_without(edits)?;
-        let voxel_m = self.voxel_grid().map_or(1.0, |voxel_grid| voxel_grid.voxel_m);
-        mesh::floaters(&mesh, voxel_m).ok_or(Error::NoFloaters)
+    fn find_floaters(&mut self, edits: &Arc<Edits>) -> Result<PendingFloaters, Error> {
+        self.update_mesh()?;
+        let voxel_grid = self.voxel_grid().cloned().ok_or(Error::NoFloaters)?;
+        let (blocks, edits) = (self.meshing.blocks().clone(), Arc::clone(edits));
+        Ok(PendingFloaters::new(move || {
+            let mesh = mesh::joined(&blocks, &voxel_grid, &edits);
+            mesh::floaters(&mesh, voxel_grid.voxel_m).ok_or(Error::NoFloaters)
+        }))
     }
 
     fn write_for_others(&mut self, folder: &Path, edits: &Edits) -> Result<(), Error> {

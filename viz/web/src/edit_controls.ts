@@ -3,7 +3,7 @@
 import type { Connection } from "./connection";
 import type { CropBox } from "./crop_box";
 import { element } from "./element";
-import type { EditMessage, ErrorMessage, ModelStatus } from "./protocol";
+import type { EditMessage, ErrorMessage, ModelStatus, Status } from "./protocol";
 
 /** Ids of edits begin here, so that they differ from those of pictures. */
 const FIRST_ID = 2 ** 40;
@@ -13,7 +13,7 @@ export class EditControls {
   private readonly undo = element("undo-edit", HTMLButtonElement);
   private readonly note = element("edit-note");
   private nSent = 0;
-  private nEdits: number | undefined;
+  private shown: string | undefined;
 
   constructor(
     private readonly connection: Connection,
@@ -46,14 +46,16 @@ export class EditControls {
     this.send({ action: "undo" }, "");
   }
 
-  /** Shows the edits of the model on the page. Returns whether their number has changed. */
-  show(model: ModelStatus): boolean {
+  /** Shows the edits of the model on the page. Returns whether the edits of any model have changed. */
+  show(status: Status, model: ModelStatus): boolean {
     this.opener.hidden = !this.connection.supports("edit");
     const nEdits = model.edits ?? 0;
     this.undo.disabled = this.opener.disabled || nEdits === 0;
     this.undo.textContent = nEdits > 0 ? `Undo (${nEdits})` : "Undo";
-    if (nEdits === this.nEdits) return false;
-    this.nEdits = nEdits;
+    // The number does not change if an undo and another edit come between two messages.
+    const shown = `${nEdits} ${status.edit_revision}`;
+    if (shown === this.shown) return false;
+    this.shown = shown;
     this.note.textContent = "";
     return true;
   }

@@ -170,7 +170,7 @@ function receiveText(message: TextMessage): void {
 function showStatus(status: Status): void {
   const model = models.shown(status);
   readouts.show(status, model);
-  const isEdited = edits.show(model);
+  const isEdited = edits.show(status, model);
   const isChanged = model.step !== latestStep;
   if (isChanged || isEdited) scheduler.modelChanged();
   if (isEdited) forgetSurfaces();

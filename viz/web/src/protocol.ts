@@ -81,6 +81,8 @@ export interface Status extends ModelStatus {
   keyframes: number;
   rejected: Record<string, number>;
   others: ModelStatus[];
+  /** Changes whenever the edits of a model change; missing on older servers. */
+  edit_revision?: number;
   notes: string[];
   result: RunResult | null;
   guidance?: Guidance;

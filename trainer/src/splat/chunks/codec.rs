@@ -23,11 +23,6 @@ const MAX_SH_COUNT: f64 = 15.0;
 /// Larger coefficients are clamped, in units of the root mean square of the chunk.
 const MAX_SH_DEVIATIONS: f64 = 4.0;
 
-/// Opacity of a splat, 0 to 1.
-pub(super) fn opacity(splats: &SplatArrays, splat_ix: u32) -> f64 {
-    1.0 / (1.0 + (-f64::from(splats.opacity_logits[splat_ix as usize])).exp())
-}
-
 /// Encodes these splats in the given order.
 pub(super) fn encode(splats: &SplatArrays, members: &[u32], scale_factor: f64, sh_degree: u32) -> ChunkData {
     let ranges = Ranges::of(splats, members, sh_degree);
@@ -96,7 +91,7 @@ impl Ranges {
             x | y << 13 | z << 26, // The upper bits of z follow.
             z >> 6 | scales[0] << 7 | scales[1] << 15 | scales[2] << 23,
             rotation_word(splats.rotations_wxyz[ix]),
-            count(opacity(splats, splat_ix), [0.0, 1.0], 8) | red << 8 | green << 16 | blue << 24,
+            count(splats.opacity(splat_ix as usize), [0.0, 1.0], 8) | red << 8 | green << 16 | blue << 24,
         ]
     }
 

@@ -7,7 +7,7 @@ mod cells;
 mod codec;
 
 use self::cells::{Cell, leaves, location_codes};
-use self::codec::{encode, opacity};
+use self::codec::encode;
 use crate::model_chunks::{ChunkData, ModelChunk, ModelChunks};
 use crate::splat::arrays::SplatArrays;
 use rayon::prelude::*;
@@ -24,8 +24,6 @@ const MAX_SCALE_FACTOR: f64 = 2.0;
 const N_PARTS: usize = 64;
 /// A change that leaves the sums of all parts as they are counts as this fraction of the sums.
 const MIN_CHANGE_FRAC: f64 = 1e-3;
-/// Splats that are more transparent are not drawn, see shared/projection.wgsl.
-const MIN_ALPHA: f64 = 1.0 / 255.0;
 
 /// Sums over the splats in each part of a cell: visible area, and the same times red, green and blue.
 type Sums = [[f64; 4]; N_PARTS];
@@ -51,8 +49,7 @@ impl Chunker {
             self.last.clear();
         }
         let is_complete = self.last.is_empty();
-        let visible = visible_splats(splats);
-        let sorted = location_codes(&splats.means, &visible);
+        let sorted = location_codes(&splats.means, &splats.visible());
         let cells = leaves(&sorted, &self.last);
         let made: Vec<(Cell, Content, ModelChunk)> = cells
             .into_par_iter()
@@ -81,21 +78,11 @@ impl Chunker {
     }
 }
 
-/// Indices of the splats that are drawn. Splats with values that are not finite are not.
-fn visible_splats(splats: &SplatArrays) -> Vec<u32> {
-    let is_finite = |ix: usize| {
-        let shape = splats.means[ix].iter().chain(&splats.log_scales[ix]).chain(&splats.rotations_wxyz[ix]);
-        shape.chain(&splats.sh[ix * splats.n_coefficients()]).all(|value| value.is_finite())
-    };
-    let is_visible = |ix: &u32| opacity(splats, *ix) > MIN_ALPHA && is_finite(*ix as usize);
-    (0..u32::try_from(splats.n_splats()).unwrap_or(u32::MAX)).filter(is_visible).collect()
-}
-
 /// Opacity times the largest cross section of a splat, square meters up to a constant factor.
 fn area(splats: &SplatArrays, splat_ix: u32) -> f64 {
     let log_scale = splats.log_scales[splat_ix as usize].map(f64::from);
     let smallest = log_scale.into_iter().fold(f64::INFINITY, f64::min);
-    opacity(splats, splat_ix) * (log_scale.iter().sum::<f64>() - smallest).exp()
+    splats.opacity(splat_ix as usize) * (log_scale.iter().sum::<f64>() - smallest).exp()
 }
 
 /// The first splats of a chunk, enlarged so that they cover its area.

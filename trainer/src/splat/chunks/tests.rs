@@ -1,6 +1,6 @@
 //! Chunks decoded as `docs/reference/protocol.md` says: errors of the values and of pictures, and what counts as changed.
 
-use super::codec::{MAX_SH_DEGREE, encode, opacity};
+use super::codec::{MAX_SH_DEGREE, encode};
 use super::{COARSE_STRIDE, Chunker};
 use crate::eval::{PixelPair, psnr};
 use crate::gpu::{Gpu, GpuOptions};
@@ -123,7 +123,7 @@ fn values_are_rounded_within_their_steps() {
     let worst_rad = angles.fold(0.0, f64::max);
     assert!(worst_rad < 0.004, "{worst_rad} rad");
     for ix in &members {
-        assert!((opacity(&got, *ix) - opacity(&splats, *ix)).abs() < 0.51 / 255.0 + 1e-3);
+        assert!((got.opacity(*ix as usize) - splats.opacity(*ix as usize)).abs() < 0.51 / 255.0 + 1e-3);
     }
     let coefficients = |splats: &SplatArrays, functions: std::ops::Range<usize>| -> Vec<f32> {
         splats.sh.chunks_exact(9).flat_map(|of| of[functions.clone()].as_flattened().to_vec()).collect()
@@ -221,7 +221,7 @@ fn changes_are_listed_where_they_are_and_by_their_size() {
         }
         known.values().sum::<usize>()
     };
-    let n_visible = |splats: &SplatArrays| super::visible_splats(splats).len();
+    let n_visible = |splats: &SplatArrays| splats.visible().len();
     let first = chunker.chunks(&splats, true);
     assert_eq!(apply(&first), n_visible(&splats));
     assert!(chunker.chunks(&splats, true).chunks.is_empty());

@@ -22,7 +22,7 @@ pub(in crate::tsdf) fn floaters(mesh: &Mesh, voxel_m: f64) -> Option<Floaters> {
     let n_cells = (4.0 * radius_m / (CELL_VOXELS * voxel_m)).clamp(N_CELLS_RANGE[0], N_CELLS_RANGE[1]);
     #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped")]
     let grid = CellGrid { center_m, radius_m, n_cells: n_cells as u32 };
-    let mut labels = CellLabels::default();
+    let mut labels = CellLabels::none(&grid);
     for corners in &mesh.triangles {
         let is_floating = is_floater_size(part_sizes[corners[0] as usize], mesh.triangles.len());
         let cells = corners.map(|ix| grid.cell_at(positions_m[ix as usize]));

@@ -53,10 +53,13 @@ pub(super) fn without_erased(mesh: &Arc<BlockMesh>, voxel_grid: &VoxelGrid, edit
     }
 }
 
+/// The triangles of each block that has some.
+pub(in crate::tsdf) type BlockMeshes = BTreeMap<GridCoord, Arc<BlockMesh>>;
+
 /// The most recent triangles of each block.
 #[derive(Debug, Default)]
 pub(in crate::tsdf) struct Mesher {
-    meshes: BTreeMap<GridCoord, Arc<BlockMesh>>,
+    meshes: BlockMeshes,
     /// Edits with which viewers last received the mesh.
     edits: Arc<Edits>,
     /// Blocks replaced since the last [`Self::take_changed`]; `None` before the first.
@@ -79,7 +82,7 @@ impl Mesher {
     }
 
     /// The triangles of all blocks that have some.
-    pub(in crate::tsdf) fn blocks(&self) -> &BTreeMap<GridCoord, Arc<BlockMesh>> {
+    pub(in crate::tsdf) fn blocks(&self) -> &BlockMeshes {
         &self.meshes
     }
 
@@ -96,30 +99,30 @@ impl Mesher {
         let blocks = self.meshes.par_iter().filter(|(_, mesh)| has_changed(mesh)).map(|(block_coord, _)| *block_coord);
         changed.par_extend(blocks);
     }
+}
 
-    /// All triangles outside erased space, in the order of their blocks; vertices shared by blocks are merged.
-    pub(in crate::tsdf) fn mesh(&self, voxel_grid: &VoxelGrid, edits: &Edits) -> Mesh {
-        let mut whole = Mesh { origin_m: voxel_grid.anchor_m, ..Mesh::default() };
-        let mut shared_vertices: HashMap<(GridCoord, u32), u32> = HashMap::new();
-        for (block_coord, mesh) in &self.meshes {
-            let mesh = without_erased(mesh, voxel_grid, edits);
-            let mut vertex_ixs = Vec::with_capacity(mesh.vertices.len());
-            for vertex in &mesh.vertices {
-                let next = u32::try_from(whole.positions_m.len()).unwrap_or(u32::MAX);
-                let at = shared_key(*block_coord, vertex.edge)
-                    .map_or(next, |key| *shared_vertices.entry(key).or_insert(next));
-                if at == next {
-                    whole.positions_m.push(vertex.position_m);
-                    whole.normals.push(unit_of(vertex.normal));
-                    let [red, green, blue, _] = vertex.color.to_le_bytes();
-                    whole.colors_srgb.push([red, green, blue]);
-                }
-                vertex_ixs.push(at);
+/// All triangles outside erased space, in world, in the order of their blocks; vertices shared by blocks are merged.
+pub(in crate::tsdf) fn joined(meshes: &BlockMeshes, voxel_grid: &VoxelGrid, edits: &Edits) -> Mesh {
+    let mut whole = Mesh { origin_m: voxel_grid.anchor_m, ..Mesh::default() };
+    let mut shared_vertices: HashMap<(GridCoord, u32), u32> = HashMap::new();
+    for (block_coord, mesh) in meshes {
+        let mesh = without_erased(mesh, voxel_grid, edits);
+        let mut vertex_ixs = Vec::with_capacity(mesh.vertices.len());
+        for vertex in &mesh.vertices {
+            let next = u32::try_from(whole.positions_m.len()).unwrap_or(u32::MAX);
+            let at =
+                shared_key(*block_coord, vertex.edge).map_or(next, |key| *shared_vertices.entry(key).or_insert(next));
+            if at == next {
+                whole.positions_m.push(vertex.position_m);
+                whole.normals.push(unit_of(vertex.normal));
+                let [red, green, blue, _] = vertex.color.to_le_bytes();
+                whole.colors_srgb.push([red, green, blue]);
             }
-            whole.triangles.extend(mesh.triangles.iter().map(|corners| corners.map(|ix| vertex_ixs[ix as usize])));
+            vertex_ixs.push(at);
         }
-        whole
+        whole.triangles.extend(mesh.triangles.iter().map(|corners| corners.map(|ix| vertex_ixs[ix as usize])));
     }
+    whole
 }
 
 /// Key of an edge that may belong to several blocks: its first voxel in the field, and its axis.

@@ -9,7 +9,7 @@ use crate::tsdf::buffers::FieldBuffers;
 use crate::tsdf::capacity::Capacity;
 use crate::tsdf::chosen_grid::VoxelGrid;
 use crate::tsdf::kernels::Pipelines;
-use crate::tsdf::mesh::{BlockMesh, ChangedChunks, Mesh, Mesher};
+use crate::tsdf::mesh::{BlockMesh, BlockMeshes, ChangedChunks, Mesher};
 use crate::tsdf::mesh_buffers::{MeshBuffers, MeshCapacity};
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -27,9 +27,9 @@ pub(super) struct Meshing {
 }
 
 impl Meshing {
-    /// The surface at the last update, in world, without erased space.
-    pub(super) fn mesh(&self, voxel_grid: &VoxelGrid, edits: &Edits) -> Mesh {
-        self.mesher.mesh(voxel_grid, edits)
+    /// The triangles of each block at the last update.
+    pub(super) fn blocks(&self) -> &BlockMeshes {
+        self.mesher.blocks()
     }
 
     /// Takes the chunks that have changed since the last call, or all of them.
