@@ -298,8 +298,8 @@ fn edits_of_operators_reach_the_run_in_order() {
     client.send_json(&json!({"type": "edit", "action": "undo", "id": 8}));
     let flat = json!({"min_m": [0, 0, 0], "max_m": [1, 0, 1]});
     for (message, named) in [
-        (json!({"type": "edit", "action": "erase", "id": 9}), "needs box"),
-        (json!({"type": "edit", "action": "undo", "box": erased, "id": 9}), "needs box"),
+        (json!({"type": "edit", "action": "erase", "id": 9}), "box is required"),
+        (json!({"type": "edit", "action": "undo", "box": erased, "id": 9}), "box is required"),
         (json!({"type": "edit", "action": "erase", "box": flat, "id": 9}), "box needs finite corners"),
         (json!({"type": "edit", "action": "paint", "id": 9}), "paint"),
     ] {
