@@ -90,7 +90,7 @@ mod tests {
         let request = EditRequest::of_nobody(EditAction::RemoveFloaters);
         let mut apply =
             |editor: &mut Editor, action: &EditAction| editor.apply(&request, action, &mut edits, &mut FailedModel);
-        let (end, ended) = mpsc::channel();
+        let (end, ended) = mpsc::sync_channel(1);
         editor.start(
             request.clone(),
             PendingFloaters::new(move || {

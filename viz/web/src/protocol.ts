@@ -82,7 +82,7 @@ export interface Status extends ModelStatus {
   rejected: Record<string, number>;
   others: ModelStatus[];
   /** Changes whenever the edits of a model change; missing on older servers. */
-  edit_revision?: number;
+  edit_revision: number;
   notes: string[];
   result: RunResult | null;
   guidance?: Guidance;
