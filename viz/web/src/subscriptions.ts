@@ -14,7 +14,7 @@ const POINTS_HZ = 20;
 /** Scans are sent this often, 36 kB each. */
 const SCANS_HZ = 2;
 const BASE_PATH_HZ = 1;
-/** Maps of observations per second, while they are shown; about 50 kB each. */
+/** Maps of observations per second, while they are shown; about 30 kB each. */
 const OBSERVATIONS_HZ = 0.5;
 /** Versions of the model per second, if the page draws it. */
 const CHUNKS_HZ = 1;
