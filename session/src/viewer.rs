@@ -38,6 +38,8 @@ pub struct ModelViewer {
     /// Pose of the page's world, which is z up, in the model's world.
     model_from_page: Transform,
     editor: Editor,
+    /// The edits in the folders of the models.
+    saved: Vec<Arc<Edits>>,
     /// What the last edit or save did.
     note: Option<String>,
     published_notes: Vec<String>,
@@ -48,6 +50,7 @@ impl ModelViewer {
     pub fn new(models: Vec<ServedModel>, hub: Hub) -> Self {
         let posed = |pose: KeyframePose| PosedKeyframe { pose, keyframe: None };
         Self {
+            saved: models.iter().map(|model| Arc::clone(&model.edits)).collect(),
             models,
             chunk_publisher: ChunkPublisher::new(hub.clone()),
             cameras: hub.keyframe_poses().into_iter().map(posed).collect(),
@@ -78,6 +81,13 @@ impl ModelViewer {
             self.publish_chunks();
             self.publish_observations();
         }
+        if self.has_unsaved_edits() {
+            log::warn!("the last edits are lost, because they were not saved on the page");
+        }
+    }
+
+    fn has_unsaved_edits(&self) -> bool {
+        self.models.iter().zip(&self.saved).any(|(model, saved)| model.path.is_dir() && model.edits != *saved)
     }
 
     fn publish_observations(&mut self) {
@@ -112,7 +122,8 @@ impl ModelViewer {
             self.report_edit(&request, edited);
         }
         if self.hub.take_controls().contains(&Control::Save) {
-            let notes = self.models.iter_mut().map(ServedModel::save_edits).collect::<Vec<_>>();
+            let saved = self.models.iter_mut().zip(&mut self.saved);
+            let notes: Vec<String> = saved.map(|(model, saved)| model.save_edits(saved)).collect();
             self.note = Some(notes.join("; "));
             self.publish_notes();
         }
@@ -134,7 +145,8 @@ impl ModelViewer {
             Ok(None) => {}
             Ok(Some(note)) => {
                 self.publish_edits();
-                self.note = Some(note);
+                let is_unsaved = self.has_unsaved_edits();
+                self.note = Some(if is_unsaved { format!("{note}; not saved yet") } else { note });
             }
             Err(reason) => self.hub.reject_edit(request, &reason),
         }
@@ -181,15 +193,21 @@ impl ModelViewer {
 }
 
 impl ServedModel {
-    /// Writes the edits into the folder of the model. Returns a note on the result.
-    fn save_edits(&mut self) -> String {
+    /// Writes the edits into the folder of the model, and updates `saved`. Returns a note on the result.
+    fn save_edits(&mut self, saved: &mut Arc<Edits>) -> String {
         let path = self.path.display();
         if !self.path.is_dir() {
             return format!("edits cannot be saved: {path} is not a model folder");
         }
-        let saved = self.edits.write(&self.path).and_then(|()| self.method.write_for_others(&self.path, &self.edits));
-        match saved {
-            Ok(()) => format!("edits saved in {path}"),
+        let written = self.edits.write(&self.path).and_then(|()| self.method.write_for_others(&self.path, &self.edits));
+        match written {
+            Ok(()) => {
+                *saved = Arc::clone(&self.edits);
+                match self.edits.len() {
+                    0 => format!("edits saved in {path}: none are left"),
+                    _ => format!("edits saved in {path}"),
+                }
+            }
             Err(error) => format!("cannot save the edits: {:#}", crate::Error::from(error)),
         }
     }

@@ -15,6 +15,18 @@ pub enum EditAction {
     Undo,
 }
 
+impl std::fmt::Display for EditAction {
+    fn fmt(&self, formatter: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Erase(Aabb { min_m: [x, y, z], max_m: [to_x, to_y, to_z], .. }) => {
+                write!(formatter, "erase the box from ({x:.3}, {y:.3}, {z:.3}) to ({to_x:.3}, {to_y:.3}, {to_z:.3}) m")
+            }
+            Self::RemoveFloaters => formatter.write_str("remove floaters"),
+            Self::Undo => formatter.write_str("undo"),
+        }
+    }
+}
+
 /// A validated request to edit a model.
 #[derive(Clone, Debug, PartialEq)]
 pub struct EditRequest {

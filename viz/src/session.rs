@@ -163,7 +163,7 @@ impl Reader<'_> {
             }
             ClientMessage::Edit(message) => {
                 let request = EditRequest::check(self.client, &message)?;
-                log::info!("client {}: {:?}", self.client, request.action());
+                log::info!("client {}: edit: {}", self.client, request.action());
                 if !self.hub.edit(request) {
                     return Err(InvalidRequest::Edits { max: MAX_WAITING_EDITS });
                 }

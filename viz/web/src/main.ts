@@ -170,6 +170,7 @@ function receiveText(message: TextMessage): void {
 function showStatus(status: Status): void {
   const model = models.shown(status);
   readouts.show(status, model);
+  view.observations.nKeyframes = status.keyframes;
   const isEdited = edits.show(status, model);
   const isChanged = model.step !== latestStep;
   if (isChanged || isEdited) scheduler.modelChanged();

@@ -22,8 +22,12 @@ const TITLES: Record<Quantity, string> = {
   age: "Time since each place was last in a keyframe",
   uncertainty: "Standard deviation of the position, from the keyframes",
 };
+/** Maps with a smaller fraction of the keyframes are incomplete. */
+const MIN_MAPPED_FRAC = 0.9;
 /** A shader's loop-free color scale. */
-const SCALE = COLORS.map((color) => new THREE.Vector3().setFromColor(new THREE.Color(color)));
+const SCALE = COLORS.map(
+  (color) => new THREE.Vector3(...[1, 3, 5].map((ix) => parseInt(color.slice(ix, ix + 2), 16) / 255)),
+);
 const MIX = SCALE.slice(1)
   .map((color, ix) => `  color = mix(color, ${glsl(color)}, clamp(worst * ${SCALE.length - 1}.0 - ${ix}.0, 0.0, 1.0));`)
   .join("\n");
@@ -70,6 +74,8 @@ export class ObservationLayer {
   private quantity: Quantity | null = null;
   private newestMillis: number | null = null;
   private hasMap = false;
+  private nMapped = 0;
+  private nAll = 0;
   /** Counts the maps, so that an older one does not replace a newer one. */
   private nReceived = 0;
 
@@ -81,6 +87,13 @@ export class ObservationLayer {
     window.setInterval(() => {
       if (this.quantity === "age" && this.newestMillis !== null) this.update();
     }, 1000);
+  }
+
+  /** Sets the number of keyframes of the run. */
+  set nKeyframes(nAll: number) {
+    if (nAll === this.nAll) return;
+    this.nAll = nAll;
+    if (this.quantity) this.update();
   }
 
   /** Sets what the tint shows; null: no tint. */
@@ -109,6 +122,7 @@ export class ObservationLayer {
     uniforms.observationCodes.value.set(header.min_age_secs, header.min_sigma_m, header.log_step);
     this.newestMillis = header.newest_millis;
     this.hasMap = true;
+    this.nMapped = header.n_keyframes;
     this.update();
   }
 
@@ -117,6 +131,11 @@ export class ObservationLayer {
     this.nReceived += 1;
     this.hasMap = false;
     this.update();
+  }
+
+  /** Without the depth of some keyframes, which is still being rendered, ages and uncertainties are too large. */
+  private progress(): string {
+    return this.nMapped < MIN_MAPPED_FRAC * this.nAll ? ` (${this.nMapped} of ${this.nAll} keyframes so far)` : "";
   }
 
   private update(): void {
@@ -129,7 +148,7 @@ export class ObservationLayer {
       uniforms.observationAge.value = Math.max(0, (age ?? 0) / 1000);
       const isSaved = quantity === "age" && this.newestMillis === null;
       element("legend-title").textContent = this.hasMap
-        ? TITLES[quantity] + (isSaved ? ", relative to the newest keyframe" : "")
+        ? TITLES[quantity] + (isSaved ? ", relative to the newest keyframe" : "") + this.progress()
         : "waiting for the map of observations";
       element("legend-labels").replaceChildren(...LABELS[quantity].map(label));
     }

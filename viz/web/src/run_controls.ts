@@ -11,7 +11,6 @@ const SAVED = ["viewing", "finished"];
 
 export class RunControls {
   private isPaused = false;
-  private hasEdits = false;
 
   constructor(private readonly connection: Connection) {
     element("pause").addEventListener("click", () => {
@@ -25,10 +24,10 @@ export class RunControls {
     element("pause").textContent = this.isPaused ? "Continue" : "Pause";
     const isRunning = CONTROLLABLE.includes(status.state);
     // Undoing all edits must be saved, too.
-    this.hasEdits ||= [status, ...status.others].some((model) => (model.edits ?? 0) > 0);
-    const canSaveEdits = SAVED.includes(status.state) && this.hasEdits;
+    const canSaveEdits = SAVED.includes(status.state) && this.connection.supports("edit");
     element("controls").hidden = !this.connection.supports("control") || !(isRunning || canSaveEdits);
     element("pause").hidden = !isRunning;
     element("save").textContent = isRunning ? "Save checkpoint" : "Save edits";
+    element("save").title = isRunning ? "Write a checkpoint now" : "Save the edits in the folder of the model";
   }
 }
