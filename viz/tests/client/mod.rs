@@ -79,6 +79,10 @@ impl Client {
                 Ok(Message::Close(_)) => {}
                 Ok(_) => {}
                 Err(tungstenite::Error::ConnectionClosed | tungstenite::Error::Protocol(_)) => return Received::End,
+                // The server has closed the connection before the reply to its close frame.
+                Err(tungstenite::Error::Io(error)) if error.kind() == std::io::ErrorKind::BrokenPipe => {
+                    return Received::End;
+                }
                 Err(error) => panic!("the connection broke: {error}"),
             }
         }
