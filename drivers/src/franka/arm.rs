@@ -252,7 +252,7 @@ impl StateReader {
         let mut last_received = clock::now();
         loop {
             let mut received = network.udp.blocking_receive(&mut buffer).ok();
-            let at = clock::now();
+            let mut at = clock::now();
             let is_fresh = at.duration_since(last_received) <= MAX_RESPONSE_GAP;
             let mut newest = None;
             while let Some(n) = received {
@@ -263,6 +263,9 @@ impl StateReader {
                     return Ok(());
                 }
                 received = network.udp.try_receive(&mut buffer).unwrap_or(None);
+                // The next state may have been sent after the previous one was read. With an earlier time it would seem
+                // to have arrived before it was sent, which would shift the stamps of all later states.
+                at = clock::now();
             }
             if let Some((from, numbered, stamp)) = newest {
                 last_received = at;
@@ -351,5 +354,35 @@ impl StateReader {
             }
             _ => log::info!("arm at {address}: mode {mode:?}"),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::tests::{TEST_TIMEOUT, config, robot, swinging_joints_at};
+    use super::*;
+
+    #[test]
+    fn stalled_thread_does_not_shift_stamps() {
+        const STALL: Duration = Duration::from_millis(50);
+        // The joints rotate by up to 0.4 rad/s.
+        const MAX_ERROR_RAD: f64 = 0.4 * 5e-3;
+        let emulated = robot(FciVersion::V10, Box::new(|stamp, _| swinging_joints_at(stamp)));
+        let mut arm = FrankaArm::open(&config(emulated.address())).unwrap();
+        let max_error_after = |arm: &mut FrankaArm, n_skipped: usize| {
+            let states: Vec<_> = (0..n_skipped + 200).map(|_| arm.read(TEST_TIMEOUT).unwrap()).collect();
+            let errors = states[n_skipped..].iter().flat_map(|state| {
+                let truth = swinging_joints_at(state.stamp);
+                std::iter::zip(&state.position, truth.position_rad).map(|(reported, is)| (reported - is).abs())
+            });
+            errors.fold(0.0, f64::max)
+        };
+        let before = max_error_after(&mut arm, 500);
+        let queue = arm.shared.state.lock();
+        std::thread::sleep(STALL);
+        drop(queue);
+        let after = max_error_after(&mut arm, 100);
+        assert!(before < MAX_ERROR_RAD && after < MAX_ERROR_RAD, "{before} rad before, {after} rad after");
+        assert_eq!(arm.statistics().n_rejected, 0, "stamps increase");
     }
 }

@@ -39,7 +39,7 @@ pub(super) fn config(address: SocketAddr) -> ArmConfig {
 }
 
 /// Joints that swing; their motion is a function of time.
-fn swinging_joints_at(stamp: Stamp) -> Joints {
+pub(super) fn swinging_joints_at(stamp: Stamp) -> Joints {
     const RATE_RAD_S: f64 = 2.0;
     let phase = RATE_RAD_S * (stamp.0 as f64 * 1e-9);
     Joints {
