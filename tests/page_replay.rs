@@ -1,6 +1,6 @@
 //! Records what a run sends to the page, and replays it to a page at the original and at double speed.
 //!
-//! WebGL is replaced by a stub, because drawing on the CPU would dominate the tasks of the page. Skipped, with a message,
+//! WebGL calls draw nothing, because drawing on the CPU would dominate the tasks of the page. Skipped, with a message,
 //! if Chromium or the bundle (`make web`) is missing.
 #![cfg(feature = "sim")]
 
@@ -11,7 +11,7 @@ mod page_server;
 mod small_rig;
 mod wire_session;
 
-use browser::{Browser, Task, WEBGL_STUB, browser_for_page, wait_for};
+use browser::{Browser, NO_DRAWING, Task, browser_for_page, wait_for};
 use page_server::PageServer;
 use serde_json::{Value, json};
 use std::collections::BTreeSet;
@@ -52,7 +52,7 @@ window.createImageBitmap = async (blob, options) => {
 
 /// Opens a page without WebGL.
 fn open(program: &Path, profile: &Path, url: &str, delay_millis: u32) -> Browser {
-    let script = format!("{WEBGL_STUB}{COUNT_DECODERS}window.decoders.delay = {delay_millis};");
+    let script = format!("{NO_DRAWING}{COUNT_DECODERS}window.decoders.delay = {delay_millis};");
     Browser::open_with(program, profile, url, WINDOW_PX, &script)
 }
 

@@ -8,6 +8,8 @@
 #[path = "../viz/tests/browser/mod.rs"]
 mod browser;
 mod page_server;
+#[path = "../viz/tests/silhouette/mod.rs"]
+mod silhouette;
 mod small_rig;
 
 use browser::{Browser, browser_for_page, canvas_shot, wait_for};
@@ -15,6 +17,7 @@ use kinematics::Transform;
 use nalgebra::{Matrix4, Point3, UnitQuaternion, Vector3};
 use page_server::PageServer;
 use serde_json::{Value, json};
+use silhouette::iou;
 use sim::{PinholeView, RobotMasks, Scene};
 use std::io::{BufRead, BufReader, ErrorKind};
 use std::net::TcpStream;
@@ -28,8 +31,6 @@ use tungstenite::{Message, WebSocket};
 const WINDOW_PX: [u32; 2] = [1280, 760];
 /// Required overlap of the drawn silhouette with MuJoCo's: intersection over union.
 const MIN_IOU: f64 = 0.97;
-/// Part of the view that nothing else covers: distance from its top and bottom edges, pixels.
-const MARGIN_PX: u32 = 60;
 /// Color of everything but the robot.
 const BACKGROUND: [u8; 3] = [220, 0, 220];
 /// Difference of a color channel between a pixel with and without the robot.
@@ -247,17 +248,6 @@ fn drawn_silhouette(browser: &mut Browser, name: &str) -> Vec<bool> {
     with_robot.pixels().zip(without_robot.pixels()).map(differs).collect()
 }
 
-fn iou(size_px: [u32; 2], a: &[bool], b: &[bool]) -> f64 {
-    let [width, height] = size_px;
-    assert_eq!([a.len(), b.len()], [(width * height) as usize; 2]);
-    let rows = (MARGIN_PX * width) as usize..((height - MARGIN_PX) * width) as usize;
-    let pairs = || a[rows.clone()].iter().zip(&b[rows.clone()]);
-    let n_both = pairs().filter(|(a, b)| **a && **b).count();
-    let n_any = pairs().filter(|(a, b)| **a || **b).count();
-    assert!(n_any > 5000, "the robot covers only {n_any} pixels");
-    n_both as f64 / n_any as f64
-}
-
 #[test]
 fn silhouette_of_a_simulated_robot_matches_the_simulator() {
     let Some(program) = browser_for_page() else { return };
@@ -281,14 +271,15 @@ fn silhouette_of_a_simulated_robot_matches_the_simulator() {
     let mut exact = Vec::new();
     for (n, state) in states.iter().enumerate() {
         *stage.state.lock().expect("no panic") = state.clone();
-        std::thread::sleep(Duration::from_millis(500));
         for is_alone in [false, true] {
-            let drawn = drawn_silhouette(&mut browser, &format!("simulated-robot-{n}-{is_alone}.png"));
             let base = pose(&state["world_from_base"]);
             let mask = masks.mask(&view, &base, &positions(state), is_alone).expect("seven joints");
-            let overlap = iou(view.size_px, &drawn, &mask);
-            eprintln!("position {n}, alone {is_alone}: IoU {overlap:.4}");
-            assert!(overlap >= MIN_IOU, "position {n}, alone {is_alone}: IoU {overlap}");
+            let name = format!("simulated-robot-{n}-{is_alone}.png");
+            wait_for(&mut browser, &format!("the silhouette in {name}"), |browser| {
+                let overlap = iou(view.size_px, &drawn_silhouette(browser, &name), &mask);
+                eprintln!("{name}: IoU {overlap:.4}");
+                overlap >= MIN_IOU
+            });
             exact.push(mask);
             browser.click("toggle-occlude");
         }

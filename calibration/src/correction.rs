@@ -84,10 +84,7 @@ pub struct CalibratedCamera {
     pub gains: [f64; 3],
 }
 
-/// Maximum differences between two calibrations of a camera that are negligible: rotation (0.03 degrees), translation,
-/// and relative focal length.
-const NOTICEABLE_RAD: f64 = 5e-4;
-const NOTICEABLE_M: f64 = 5e-4;
+/// Maximum relative difference between two focal lengths that is negligible.
 const NOTICEABLE_FOCAL: f64 = 1e-3;
 
 impl CalibratedCamera {
@@ -95,9 +92,7 @@ impl CalibratedCamera {
     pub fn differs_noticeably(&self, other: &Self) -> bool {
         let motion = self.world_from_camera.inverse() * other.world_from_camera;
         let focal_change = (0..2).map(|axis| (other.focal_px[axis] / self.focal_px[axis] - 1.0).abs());
-        motion.rotation.angle() > NOTICEABLE_RAD
-            || motion.translation.vector.norm() > NOTICEABLE_M
-            || focal_change.fold(0.0, f64::max) > NOTICEABLE_FOCAL
+        transform::is_noticeable(&motion) || focal_change.fold(0.0, f64::max) > NOTICEABLE_FOCAL
     }
 
     /// The uncorrected camera of a keyframe.

@@ -68,6 +68,17 @@ pub fn to_rows(transform: &Transform) -> [f64; 16] {
     std::array::from_fn(|at| matrix[(at / 4, at % 4)])
 }
 
+/// Smaller motions of a camera are noticeable neither in a picture nor in a map of the scene.
+const NOTICEABLE_M: f64 = 5e-4;
+const NOTICEABLE_RAD: f64 = 5e-4;
+
+/// Whether a camera has moved noticeably: by more than 0.5 mm or 0.5 mrad (0.03 degrees).
+///
+/// * `motion`: pose of the camera after the motion, in its own frame before.
+pub fn is_noticeable(motion: &Transform) -> bool {
+    motion.translation.vector.norm() > NOTICEABLE_M || motion.rotation.angle() > NOTICEABLE_RAD
+}
+
 /// Whether all elements of a pose are finite.
 pub fn is_finite(transform: &Transform) -> bool {
     transform.translation.vector.iter().chain(transform.rotation.coords.iter()).all(|number| number.is_finite())

@@ -7,7 +7,7 @@ use crate::observations::{ModelState, ObservationPublisher, PosedKeyframe};
 use crate::recoveries::{self, OpenGpu, Recoveries};
 use crate::render_budget::RenderBudget;
 use crate::session::Session;
-use crate::{scene_hint, time_slices};
+use crate::{methods, scene_hint, time_slices};
 use calibration::CalibratedCamera;
 use capture::{Change, Feed, FeedItem, InputResult, Notes};
 use keyframe::{Keyframe, Split};
@@ -318,9 +318,7 @@ impl Live {
 
     /// Why there is no model of this method.
     fn unknown_method(&self, method: Option<&str>) -> String {
-        let available_methods =
-            self.sessions.iter().map(|session| session.kind().name()).collect::<Vec<_>>().join(" or ");
-        format!("no model with the method {:?}; use {available_methods}", method.unwrap_or_default())
+        methods::unknown(self.sessions.iter().map(Session::kind), method)
     }
 
     /// Pushes new keyframes to the models: all waiting keyframes in real time, or the keyframe that is due in lockstep.
@@ -544,15 +542,19 @@ impl Live {
             return;
         }
         let session = &mut self.sessions[0];
-        let posed = |keyframe: &Arc<Keyframe>| PosedKeyframe {
-            pose: frustum(keyframe, &session.camera_of(keyframe)),
-            keyframe: Some(Arc::clone(keyframe)),
+        let posed = |keyframe: &Arc<Keyframe>| {
+            let camera = session.camera_of(keyframe);
+            PosedKeyframe {
+                pose: frustum(keyframe, &camera),
+                keyframe: Some(Arc::clone(keyframe)),
+                color_from_depth: camera.color_from_depth.unwrap_or_default(),
+            }
         };
         let keyframes: Vec<PosedKeyframe> = self.keyframes.iter().map(posed).collect();
         let captured_at = |pose: &KeyframePose| {
             let mut newest_first = self.ledger.keyframes().iter().rev();
             let times = newest_first.find(|times| times.camera == pose.camera && times.stamp == pose.stamp)?;
-            Some(times.input.captured.unwrap_or(times.input.arrived))
+            Some(times.captured_at())
         };
         let edits = Arc::clone(session.edits());
         let model = ModelState { step: session.progress().step, edits: &edits, captured_at: &captured_at };

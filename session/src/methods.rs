@@ -71,6 +71,12 @@ pub fn specs(kinds: &[ModelKind], common: &CommonOptions, settings: &Settings) -
     kinds.iter().map(spec).collect::<Result<_, _>>().map_err(|error| Error::BadInput(error.to_string()))
 }
 
+/// Why there is no model of the requested method among these.
+pub(crate) fn unknown(kinds: impl Iterator<Item = ModelKind>, requested: Option<&str>) -> String {
+    let names = kinds.map(ModelKind::name).collect::<Vec<_>>().join(" or ");
+    format!("no model with the method {:?}; use {names}", requested.unwrap_or_default())
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

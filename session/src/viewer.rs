@@ -2,6 +2,7 @@
 
 use crate::chunk_publisher::ChunkPublisher;
 use crate::editing::{self, Editor};
+use crate::methods;
 use crate::observations::{ModelState, ObservationPublisher, PosedKeyframe};
 use capture::Stop;
 use kinematics::Transform;
@@ -48,7 +49,8 @@ pub struct ModelViewer {
 impl ModelViewer {
     /// A viewer of models whose z axis points up. The keyframes of the hub are the views of the model's training images.
     pub fn new(models: Vec<ServedModel>, hub: Hub) -> Self {
-        let posed = |pose: KeyframePose| PosedKeyframe { pose, keyframe: None };
+        let posed =
+            |pose: KeyframePose| PosedKeyframe { pose, keyframe: None, color_from_depth: Transform::identity() };
         Self {
             saved: models.iter().map(|model| Arc::clone(&model.edits)).collect(),
             models,
@@ -215,12 +217,10 @@ impl ServedModel {
 
 /// The model of this method; the first one if no method is given.
 fn model_mut<'a>(models: &'a mut [ServedModel], method: Option<&str>) -> Result<&'a mut ServedModel, String> {
-    let names = models.iter().map(|model| model.kind.name()).collect::<Vec<_>>().join(" or ");
-    let is_requested = |model: &&mut ServedModel| method.is_none_or(|name| model.kind.name() == name);
-    models
-        .iter_mut()
-        .find(is_requested)
-        .ok_or_else(|| format!("no model with the method {:?}; use {names}", method.unwrap_or_default()))
+    match models.iter().position(|model| method.is_none_or(|name| model.kind.name() == name)) {
+        Some(ix) => Ok(&mut models[ix]),
+        None => Err(methods::unknown(models.iter().map(|model| model.kind), method)),
+    }
 }
 
 /// Transforms a box from the page's world frame to the model's world frame.

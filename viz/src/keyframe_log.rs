@@ -6,9 +6,6 @@ use crate::updates::KeyframePose;
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 
-/// Smaller motions of a keyframe are not sent: they are invisible on a screen, but optimization makes them all the time.
-const NOTICEABLE_M: f64 = 5e-4;
-const NOTICEABLE_RAD: f64 = 5e-4;
 /// Maximum number of remembered removals. A client that has not received older ones gets the complete list.
 const MAX_REMOVALS: usize = 1024;
 
@@ -159,11 +156,12 @@ impl KeyframeLog {
     }
 }
 
+/// Smaller motions are not sent, because optimization makes them all the time.
 fn has_changed(before: &KeyframePose, after: &KeyframePose) -> bool {
     let motion = before.world_from_camera.inverse() * after.world_from_camera;
     let is_same_lens =
         (before.size_px, before.focal_px, before.principal_px) == (after.size_px, after.focal_px, after.principal_px);
-    !is_same_lens || motion.translation.vector.norm() > NOTICEABLE_M || motion.rotation.angle() > NOTICEABLE_RAD
+    !is_same_lens || kinematics::transform::is_noticeable(&motion)
 }
 
 #[cfg(test)]

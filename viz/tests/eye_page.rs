@@ -1,5 +1,5 @@
-//! Opens the bundled page in a real browser inside of a room, and moves the view by wheel, drags, keys and thumbs: the
-//! eye stops before walls. WebGL is replaced by a stub: the requests show where the eye is.
+//! Opens the bundled page in a real browser inside a room, and moves the view by wheel, drags, keys and thumbs: the
+//! eye stops before walls. WebGL calls draw nothing, because the requests show where the eye is.
 //!
 //! Skipped, with a message, if Chromium or the bundle (`make web`) is missing.
 
@@ -7,11 +7,13 @@
 mod analytic_scene;
 #[expect(dead_code, reason = "another test measures tasks")]
 mod browser;
+mod request_thread;
 
 use analytic_scene::ray_in_world;
-use browser::{Browser, WEBGL_STUB, browser_for_page, wait_for};
+use browser::{Browser, NO_DRAWING, browser_for_page, wait_for};
 use kinematics::Transform;
 use nalgebra::{Point3, UnitQuaternion, Vector3};
+use request_thread::RequestThread;
 use serde_json::json;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
@@ -75,34 +77,28 @@ struct Renderer {
     n_panoramas: Arc<AtomicUsize>,
     has_panoramas: Arc<AtomicBool>,
     has_pillar: Arc<AtomicBool>,
-    stop: Arc<AtomicBool>,
-    thread: Option<std::thread::JoinHandle<()>>,
+    _thread: RequestThread,
 }
 
 impl Renderer {
     fn start(hub: Hub) -> Self {
         let requests: Arc<Mutex<Vec<RenderRequest>>> = Arc::default();
-        let [has_panoramas, has_pillar, stop] = [true, true, false].map(|is_on| Arc::new(AtomicBool::new(is_on)));
+        let [has_panoramas, has_pillar] = [true; 2].map(|is_on| Arc::new(AtomicBool::new(is_on)));
         let n_panoramas: Arc<AtomicUsize> = Arc::default();
-        let (received, n_received, stopped) = (Arc::clone(&requests), Arc::clone(&n_panoramas), Arc::clone(&stop));
+        let (received, n_received) = (Arc::clone(&requests), Arc::clone(&n_panoramas));
         let (panoramas, pillar) = (Arc::clone(&has_panoramas), Arc::clone(&has_pillar));
-        let thread = std::thread::spawn(move || {
-            while !stopped.load(Ordering::Relaxed) {
-                hub.wait_for_request(Duration::from_millis(50));
-                let Some(pending) = hub.next_request() else { continue };
-                let is_panorama = pending.request.projection == Projection::Equirectangular;
-                n_received.fetch_add(usize::from(is_panorama), Ordering::Relaxed);
-                if !is_panorama {
-                    received.lock().expect("no panic").push(pending.request.clone());
-                } else if !panoramas.load(Ordering::Relaxed) {
-                    pending.fail("no panoramas");
-                    continue;
-                }
-                let picture = draw(&pending.request, pillar.load(Ordering::Relaxed));
-                pending.deliver(picture);
+        let thread = RequestThread::start(hub, move |pending| {
+            let is_panorama = pending.request.projection == Projection::Equirectangular;
+            n_received.fetch_add(usize::from(is_panorama), Ordering::Relaxed);
+            if !is_panorama {
+                received.lock().expect("no panic").push(pending.request.clone());
+            } else if !panoramas.load(Ordering::Relaxed) {
+                return pending.fail("no panoramas");
             }
+            let picture = draw(&pending.request, pillar.load(Ordering::Relaxed));
+            pending.deliver(picture);
         });
-        Self { requests, n_panoramas, has_panoramas, has_pillar, stop, thread: Some(thread) }
+        Self { requests, n_panoramas, has_panoramas, has_pillar, _thread: thread }
     }
 
     fn n_requests(&self) -> usize {
@@ -125,15 +121,6 @@ impl Renderer {
 
     fn forward(&self) -> Vector3<f64> {
         self.last().world_from_camera.rotation * Vector3::z()
-    }
-}
-
-impl Drop for Renderer {
-    fn drop(&mut self) {
-        self.stop.store(true, Ordering::Relaxed);
-        if let Some(thread) = self.thread.take() {
-            assert!(thread.join().is_ok() || std::thread::panicking(), "the render thread panicked");
-        }
     }
 }
 
@@ -170,7 +157,7 @@ impl Page {
         renderer.has_panoramas.store(has_panoramas, Ordering::Relaxed);
         let scratch = PathBuf::from(env!("CARGO_TARGET_TMPDIR"));
         let profile = scratch.join(format!("chromium-{name}-{}", std::process::id()));
-        let browser = Browser::open_with(&program, &profile, &server.url(), WINDOW_PX, WEBGL_STUB);
+        let browser = Browser::open_with(&program, &profile, &server.url(), WINDOW_PX, NO_DRAWING);
         let mut page = Self { _alone: alone, browser, renderer, hub, profile, _server: server };
         page.rest();
         Some(page)

@@ -6,12 +6,14 @@ mod analytic_scene;
 #[expect(dead_code, reason = "another test measures tasks")]
 mod browser;
 mod proxy;
+mod request_thread;
 
 use analytic_scene::{draw, looking_along_y};
 use browser::{Browser, browser_for_page, canvas_bounds, canvas_shot, wait_for};
 use kinematics::{Stamp, Transform};
 use nalgebra::{Point3, Translation3, UnitQuaternion, Vector3};
 use proxy::{Link, Proxy};
+use request_thread::RequestThread;
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -55,30 +57,22 @@ struct RenderThread {
     received_requests: Arc<Mutex<Vec<ReceivedRequest>>>,
     /// Added to the render time of each picture.
     drawing_millis: Arc<AtomicU64>,
-    stop: Arc<AtomicBool>,
-    thread: Option<std::thread::JoinHandle<()>>,
+    _thread: RequestThread,
 }
 
 impl RenderThread {
     fn start(hub: Hub) -> Self {
         let received_requests: Arc<Mutex<Vec<ReceivedRequest>>> = Arc::default();
         let drawing_millis = Arc::new(AtomicU64::new(DRAWING_MILLIS));
-        let stop: Arc<AtomicBool> = Arc::default();
-        let (received, stopped) = (Arc::clone(&received_requests), Arc::clone(&stop));
-        let drawing = Arc::clone(&drawing_millis);
-        let thread = std::thread::spawn(move || {
-            while !stopped.load(Ordering::Relaxed) {
-                hub.wait_for_request(Duration::from_millis(50));
-                if let Some(pending) = hub.next_request() {
-                    let order = (pending.request.clone(), pending.method().map(str::to_owned));
-                    received.lock().expect("no thread panicked while holding the lock").push(order);
-                    let picture = draw(&pending.request);
-                    std::thread::sleep(Duration::from_millis(drawing.load(Ordering::Relaxed)));
-                    pending.deliver(picture);
-                }
-            }
+        let (received, drawing) = (Arc::clone(&received_requests), Arc::clone(&drawing_millis));
+        let thread = RequestThread::start(hub, move |pending| {
+            let order = (pending.request.clone(), pending.method().map(str::to_owned));
+            received.lock().expect("no thread panicked while holding the lock").push(order);
+            let picture = draw(&pending.request);
+            std::thread::sleep(Duration::from_millis(drawing.load(Ordering::Relaxed)));
+            pending.deliver(picture);
         });
-        Self { received_requests, drawing_millis, stop, thread: Some(thread) }
+        Self { received_requests, drawing_millis, _thread: thread }
     }
 
     /// The requests of the main view. Panoramas are requested for its surroundings.
@@ -99,15 +93,6 @@ impl RenderThread {
             .iter()
             .map(|(_, method)| method.clone())
             .collect()
-    }
-}
-
-impl Drop for RenderThread {
-    fn drop(&mut self) {
-        self.stop.store(true, Ordering::Relaxed);
-        if let Some(thread) = self.thread.take() {
-            assert!(thread.join().is_ok() || std::thread::panicking(), "the render thread panicked");
-        }
     }
 }
 
@@ -506,9 +491,10 @@ fn page_shows_connection_loss_and_run_result() {
     let camera = Camera::start(hub.clone());
     wait_for(&mut browser, "a full picture", |browser| browser.text("picture-text").contains("100 %"));
     wait_for(&mut browser, "a live image", |browser| label(browser) == "live");
+    wait_for(&mut browser, "the end of delays", |browser| browser.text("banner").is_empty());
     browser.evaluate(RECORDER);
-    assert_eq!(browser.text("banner"), "");
     save_screenshot(&mut browser, "connected");
+    let bounds = canvas_bounds(&mut browser);
 
     browser.evaluate("record.cutAt = performance.now()");
     proxy.cut();
@@ -516,6 +502,7 @@ fn page_shows_connection_loss_and_run_result() {
     std::thread::sleep(Duration::from_millis(1500));
     assert!(browser.text("banner").starts_with("No data from the server for "), "{}", browser.text("banner"));
     wait_for(&mut browser, "attempts to reconnect", |browser| browser.text("banner").contains("reconnecting"));
+    assert_eq!(canvas_bounds(&mut browser), bounds, "the view keeps its size during an outage");
     save_screenshot(&mut browser, "lost");
     std::thread::sleep(CUT.saturating_sub(cut_at.elapsed()));
     camera.stop();
@@ -523,12 +510,11 @@ fn page_shows_connection_loss_and_run_result() {
     browser.evaluate("record.isLive = false");
     proxy.restore();
     wait_for(&mut browser, "the return", |browser| browser.text("connection").contains("connected"));
-    std::thread::sleep(Duration::from_millis(1500));
-    assert_eq!(browser.text("banner"), "");
+    wait_for(&mut browser, "the end of the outage", |browser| browser.text("banner").is_empty());
     let shown_after = browser.evaluate("record.shownAfter").as_f64().expect("the loss was shown");
     assert!(shown_after < MAX_LOSS_DISPLAY_MILLIS, "the lost connection was shown after {shown_after} ms");
     assert_eq!(browser.evaluate("record.isLive"), false, "an image from before the cut was labeled live");
-    assert!(label(&mut browser).contains("old"), "{}", label(&mut browser));
+    wait_for(&mut browser, "the age of the last image", |browser| label(browser).contains("old"));
     let camera = Camera::start(hub.clone());
     wait_for(&mut browser, "a live image", |browser| label(browser) == "live");
     camera.stop();

@@ -6,7 +6,7 @@ mod analytic_scene;
 #[expect(dead_code, reason = "other tests look at the page")]
 mod browser;
 
-use browser::{Browser, WEBGL_STUB, browser_for_page, wait_for};
+use browser::{Browser, NO_DRAWING, browser_for_page, wait_for};
 use std::path::PathBuf;
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -84,7 +84,7 @@ fn time_from_the_camera_to_the_screen_is_shown_and_reported() {
     (0..5).for_each(|_| model.add_keyframe());
     std::thread::scope(|scope| {
         scope.spawn(|| model.run());
-        let mut browser = Browser::open_with(&program, &profile, &server.url(), WINDOW_PX, WEBGL_STUB);
+        let mut browser = Browser::open_with(&program, &profile, &server.url(), WINDOW_PX, NO_DRAWING);
         wait_for(&mut browser, "a full picture", |browser| browser.text("picture-text").contains("100 %"));
         model.wait_for_picture(&mut browser);
         assert_eq!(browser.text("shown-text"), "", "the page has not waited for these keyframes");

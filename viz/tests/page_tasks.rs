@@ -9,7 +9,7 @@ mod browser;
 #[expect(dead_code, reason = "other tests compare the robot with ray casting")]
 mod robot;
 
-use browser::{Browser, WEBGL_STUB, browser_for_page, wait_for};
+use browser::{Browser, NO_DRAWING, browser_for_page, wait_for};
 use kinematics::{Stamp, Transform};
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -96,7 +96,7 @@ fn tasks_of_the_main_thread_are_short() {
     let tasks = std::thread::scope(|scope| {
         scope.spawn(|| publish(&hub, &is_over));
         scope.spawn(|| deliver(&hub, &is_over));
-        let mut browser = Browser::open_with(&program, &profile, &server.url(), WINDOW_PX, WEBGL_STUB);
+        let mut browser = Browser::open_with(&program, &profile, &server.url(), WINDOW_PX, NO_DRAWING);
         wait_for(&mut browser, "a full picture", |browser| browser.text("picture-text").contains("100 %"));
         let tasks = browser.trace_tasks(DURATION);
         assert!(browser.text("picture-text").contains("100 %"), "pictures still arrive");

@@ -6,12 +6,16 @@
 mod analytic_scene;
 #[expect(dead_code, reason = "another test measures tasks")]
 mod browser;
+mod request_thread;
 mod robot;
+mod silhouette;
 
 use analytic_scene::{draw, looking_along_y, ray_in_world};
 use browser::{Browser, browser_for_page, canvas_bounds, canvas_shot, wait_for};
 use kinematics::Chain;
 use nalgebra::{Point3, Translation3, Vector3};
+use request_thread::RequestThread;
+use silhouette::iou;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
@@ -22,8 +26,6 @@ use viz::{Hub, RobotState, SceneHint, Server, ServerConfig};
 const WINDOW_PX: [u32; 2] = [1280, 760];
 /// Required overlap of the drawn silhouette with the exact one: intersection over union.
 const MIN_IOU: f64 = 0.97;
-/// Part of the view that nothing else covers: distance from its top and bottom edges, pixels.
-const MARGIN_PX: u32 = 60;
 
 /// Draws pictures and moves the robot on separate threads, like a run.
 struct Run {
@@ -31,7 +33,8 @@ struct Run {
     base_x: Arc<Mutex<f64>>,
     requests: Arc<Mutex<Vec<RenderRequest>>>,
     stop: Arc<AtomicBool>,
-    threads: Vec<std::thread::JoinHandle<()>>,
+    _renderer: RequestThread,
+    arm: Option<std::thread::JoinHandle<()>>,
 }
 
 impl Run {
@@ -39,22 +42,15 @@ impl Run {
         let angle: Arc<Mutex<f64>> = Arc::default();
         let requests: Arc<Mutex<Vec<RenderRequest>>> = Arc::default();
         let stop: Arc<AtomicBool> = Arc::default();
-        let renderer = {
-            let (hub, requests, stop) = (hub.clone(), Arc::clone(&requests), Arc::clone(&stop));
-            std::thread::spawn(move || {
-                while !stop.load(Ordering::Relaxed) {
-                    hub.wait_for_request(Duration::from_millis(50));
-                    if let Some(pending) = hub.next_request() {
-                        // Panoramas are requested for the surroundings of the view.
-                        if pending.request.projection != Projection::Equirectangular {
-                            requests.lock().expect("no panic").push(pending.request.clone());
-                        }
-                        let picture = draw(&pending.request);
-                        pending.deliver(picture);
-                    }
-                }
-            })
-        };
+        let received = Arc::clone(&requests);
+        let renderer = RequestThread::start(hub.clone(), move |pending| {
+            // Panoramas are requested for the surroundings of the view.
+            if pending.request.projection != Projection::Equirectangular {
+                received.lock().expect("no panic").push(pending.request.clone());
+            }
+            let picture = draw(&pending.request);
+            pending.deliver(picture);
+        });
         let base_x: Arc<Mutex<f64>> = Arc::default();
         let arm = {
             let (hub, stop) = (hub.clone(), Arc::clone(&stop));
@@ -69,7 +65,7 @@ impl Run {
                 }
             })
         };
-        Self { angle, base_x, requests, stop, threads: vec![renderer, arm] }
+        Self { angle, base_x, requests, stop, _renderer: renderer, arm: Some(arm) }
     }
 
     /// Moves the base along x.
@@ -81,16 +77,16 @@ impl Run {
         *self.angle.lock().expect("no panic") = angle;
     }
 
-    fn last_request(&self) -> RenderRequest {
-        self.requests.lock().expect("no panic").last().expect("a picture was requested").clone()
+    fn last_request(&self) -> Option<RenderRequest> {
+        self.requests.lock().expect("no panic").last().cloned()
     }
 }
 
 impl Drop for Run {
     fn drop(&mut self) {
         self.stop.store(true, Ordering::Relaxed);
-        for thread in self.threads.drain(..) {
-            assert!(thread.join().is_ok() || std::thread::panicking(), "a thread of the run panicked");
+        if let Some(arm) = self.arm.take() {
+            assert!(arm.join().is_ok() || std::thread::panicking(), "the arm panicked");
         }
     }
 }
@@ -120,16 +116,6 @@ fn drawn_silhouette(shot: &image::RgbImage) -> Vec<bool> {
     shot.pixels().map(is_yellow).collect()
 }
 
-fn iou(request: &RenderRequest, a: &[bool], b: &[bool]) -> f64 {
-    let [width, height] = request.size_px;
-    let rows = (MARGIN_PX * width) as usize..((height - MARGIN_PX) * width) as usize;
-    let pairs = || a[rows.clone()].iter().zip(&b[rows.clone()]);
-    let n_both = pairs().filter(|(a, b)| **a && **b).count();
-    let n_any = pairs().filter(|(a, b)| **a || **b).count();
-    assert!(n_any > 5000, "the robot covers only {n_any} pixels");
-    n_both as f64 / n_any as f64
-}
-
 #[test]
 fn robot_silhouette_is_exact_in_front_and_behind() {
     let Some(program) = browser_for_page() else { return };
@@ -145,29 +131,31 @@ fn robot_silhouette_is_exact_in_front_and_behind() {
     let scratch = PathBuf::from(env!("CARGO_TARGET_TMPDIR"));
     let profile = scratch.join(format!("chromium-robot-{}", std::process::id()));
     let mut browser = Browser::open(&program, &profile, &server.url(), WINDOW_PX);
-    wait_for(&mut browser, "a full picture", |browser| browser.text("picture-text").contains("100 %"));
+    wait_for(&mut browser, "a picture", |browser| browser.text("picture-text").contains("100 %"));
+    let request = full_request(&mut browser, &run, "a full picture", |_| true);
     browser.click("toggle-grid");
-    let request = run.last_request();
 
     let mut masks = Vec::new();
     for angle in [0.0, 0.9] {
         run.rotate_to(angle);
-        std::thread::sleep(Duration::from_millis(500));
         for is_occluded in [true, false] {
-            let shot = canvas_shot(&mut browser);
-            let name = format!("page-robot-{angle}-{}.png", if is_occluded { "occluded" } else { "in-front" });
-            shot.save(scratch.join(name)).expect("written");
-            assert_eq!([shot.width(), shot.height()], request.size_px);
             let exact = exact_silhouette(&request, &robot::state(angle), is_occluded);
-            let overlap = iou(&request, &drawn_silhouette(&shot), &exact);
-            assert!(overlap >= MIN_IOU, "angle {angle}, occluded {is_occluded}: IoU {overlap}");
+            let name = format!("page-robot-{angle}-{}.png", if is_occluded { "occluded" } else { "in-front" });
+            wait_for(&mut browser, &format!("the silhouette in {name}"), |browser| {
+                let shot = canvas_shot(browser);
+                shot.save(scratch.join(&name)).expect("written");
+                assert_eq!([shot.width(), shot.height()], request.size_px);
+                let overlap = iou(request.size_px, &drawn_silhouette(&shot), &exact);
+                eprintln!("{name}: IoU {overlap:.4}");
+                overlap >= MIN_IOU
+            });
             masks.push(exact);
             browser.click("toggle-occlude");
         }
     }
     // The cases differ, so that a wrong case would have been detected.
     for (a, b) in [(0, 1), (0, 2), (2, 3)] {
-        let similarity = iou(&request, &masks[a], &masks[b]);
+        let similarity = iou(request.size_px, &masks[a], &masks[b]);
         assert!(similarity < MIN_IOU - 0.02, "cases {a} and {b} are too similar: {similarity}");
     }
     assert_eq!(browser.evaluate("document.getElementById('robot-age').hidden"), true, "the pose is live");
@@ -181,9 +169,25 @@ fn robot_silhouette_is_exact_in_front_and_behind() {
     std::fs::remove_dir_all(&profile).expect("the browser has left its profile");
 }
 
+/// Waits for a picture in full resolution that has this property, and returns its request.
+fn full_request(
+    browser: &mut Browser,
+    run: &Run,
+    what: &str,
+    is_expected: impl Fn(&RenderRequest) -> bool,
+) -> RenderRequest {
+    let mut full = None;
+    wait_for(browser, what, |browser| {
+        let [.., width, height] = canvas_bounds(browser);
+        full = run.last_request().filter(|request| request.size_px == [width, height] && is_expected(request));
+        full.is_some()
+    });
+    full.expect("the wait has ended")
+}
+
 /// A double click rotates the view toward the surface at that pixel.
 fn check_pivot(browser: &mut Browser, run: &Run) {
-    let before = run.last_request();
+    let before = full_request(browser, run, "a full picture", |_| true);
     let [x, y] = [before.size_px[0] / 2 - 150, before.size_px[1] / 2 + 250];
     let ix = (y * before.size_px[0] + x) as usize;
     let depth = f64::from(draw(&before).depth_m[ix]);
@@ -197,8 +201,10 @@ fn check_pivot(browser: &mut Browser, run: &Run) {
         top + y
     ));
     wait_for(browser, "a view toward the surface", |_| {
-        let in_camera = run.last_request().world_from_camera.inverse_transform_point(&surface);
-        in_camera.z > 0.0 && in_camera.coords.xy().norm() < 0.02 * in_camera.z
+        run.last_request().is_some_and(|request| {
+            let in_camera = request.world_from_camera.inverse_transform_point(&surface);
+            in_camera.z > 0.0 && in_camera.coords.xy().norm() < 0.02 * in_camera.z
+        })
     });
 }
 
@@ -206,19 +212,17 @@ fn check_pivot(browser: &mut Browser, run: &Run) {
 fn check_views(browser: &mut Browser, run: &Run) {
     for (button, forward) in [("look-top", -Vector3::z()), ("look-front", Vector3::y())] {
         browser.click(button);
-        wait_for(browser, button, |_| {
-            (run.last_request().world_from_camera.rotation * Vector3::z() - forward).norm() < 0.01
+        full_request(browser, run, button, |request| {
+            (request.world_from_camera.rotation * Vector3::z() - forward).norm() < 0.01
         });
     }
 }
 
 /// The crop box encloses the scene; dragging a handle moves one side and not the view.
 fn check_crop(browser: &mut Browser, run: &Run) {
-    assert_eq!(run.last_request().crop, None);
+    assert_eq!(full_request(browser, run, "a full picture", |_| true).crop, None);
     browser.click("toggle-crop");
-    wait_for(browser, "a cropped picture", |_| run.last_request().crop.is_some());
-    wait_for(browser, "a full picture", |browser| browser.text("picture-text").contains("100 %"));
-    let before = run.last_request();
+    let before = full_request(browser, run, "a cropped picture", |request| request.crop.is_some());
     let crop = before.crop.expect("a crop");
     let expected = [[-0.48, -0.48, -0.28], [0.48, 0.48, 0.68]]; // 1.2 times the radius, around the center.
     for (corner, expected) in [crop.min_m, crop.max_m].iter().zip(expected) {
@@ -237,15 +241,14 @@ fn check_crop(browser: &mut Browser, run: &Run) {
     browser.mouse("mouseReleased", [handle[0] - 80, handle[1]]);
     // 80 pixels at the depth of the handle.
     let expected_x = 0.48 - 80.0 * in_camera.z / focal_px[0];
-    wait_for(browser, "a smaller box", |_| {
-        run.last_request().crop.is_some_and(|crop| (crop.max_m[0] - expected_x).abs() < 0.02)
+    let after = full_request(browser, run, "a smaller box", |request| {
+        request.crop.is_some_and(|crop| (crop.max_m[0] - expected_x).abs() < 0.02)
     });
-    let after = run.last_request();
     assert_eq!(after.crop.map(|crop| (crop.min_m, crop.max_m[1])), Some((crop.min_m, crop.max_m[1])));
     let motion = before.world_from_camera.inverse() * after.world_from_camera;
     assert!(motion.translation.vector.norm() < 1e-6, "the view has not moved");
     browser.click("toggle-crop");
-    wait_for(browser, "the whole scene", |_| run.last_request().crop.is_none());
+    full_request(browser, run, "the whole scene", |request| request.crop.is_none());
 }
 
 /// The view follows the arm.
@@ -256,13 +259,13 @@ fn check_follow(browser: &mut Browser, run: &Run) {
     };
     // The last joint rotates the arm about its own axis, so that the origin of its link stays.
     assert!((tip(0.9) - tip(0.2)).norm() < 1e-9);
-    let before = run.last_request().world_from_camera.translation.vector;
+    let before = full_request(browser, run, "a full picture", |_| true).world_from_camera.translation.vector;
     browser.click("toggle-follow");
     run.rotate_to(0.2);
     std::thread::sleep(Duration::from_millis(300));
     run.move_base(0.25);
-    wait_for(browser, "a view that has moved with the base", |_| {
-        let moved = run.last_request().world_from_camera.translation.vector - before;
+    full_request(browser, run, "a view that has moved with the base", |request| {
+        let moved = request.world_from_camera.translation.vector - before;
         (moved - Vector3::new(0.25, 0.0, 0.0)).norm() < 1e-3
     });
 }

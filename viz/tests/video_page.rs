@@ -5,15 +5,15 @@
 mod analytic_scene;
 #[expect(dead_code, reason = "other tests look at the page")]
 mod browser;
+mod request_thread;
 
 use analytic_scene::{draw, looking_along_y};
-use browser::{Browser, WEBGL_STUB, browser_for_page, wait_for};
+use browser::{Browser, NO_DRAWING, browser_for_page, wait_for};
 use nalgebra::Vector3;
+use request_thread::RequestThread;
 use serde_json::json;
 use std::path::PathBuf;
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
-use std::time::Duration;
 use trainer::RenderRequest;
 use viz::{Hub, SceneHint, Server, ServerConfig};
 
@@ -65,38 +65,24 @@ const PLAY: &str = "(async () => {
 /// Draws pictures. Those of the video have no depth.
 struct Renderer {
     requests: Arc<Mutex<Vec<RenderRequest>>>,
-    stop: Arc<AtomicBool>,
-    thread: Option<std::thread::JoinHandle<()>>,
+    _thread: RequestThread,
 }
 
 impl Renderer {
     fn start(hub: Hub) -> Self {
-        let (requests, stop): (Arc<Mutex<Vec<RenderRequest>>>, Arc<AtomicBool>) = Default::default();
-        let (received, stopped) = (Arc::clone(&requests), Arc::clone(&stop));
-        let thread = std::thread::spawn(move || {
-            while !stopped.load(Ordering::Relaxed) {
-                hub.wait_for_request(Duration::from_millis(50));
-                let Some(pending) = hub.next_request() else { continue };
-                received.lock().expect("no panic").push(pending.request.clone());
-                let picture = draw(&pending.request);
-                pending.deliver(picture);
-            }
+        let requests: Arc<Mutex<Vec<RenderRequest>>> = Arc::default();
+        let received = Arc::clone(&requests);
+        let thread = RequestThread::start(hub, move |pending| {
+            received.lock().expect("no panic").push(pending.request.clone());
+            let picture = draw(&pending.request);
+            pending.deliver(picture);
         });
-        Self { requests, stop, thread: Some(thread) }
+        Self { requests, _thread: thread }
     }
 
     fn requests(&self, is_video: bool) -> Vec<RenderRequest> {
         let requests = self.requests.lock().expect("no panic");
         requests.iter().filter(|request| request.depth != is_video).cloned().collect()
-    }
-}
-
-impl Drop for Renderer {
-    fn drop(&mut self) {
-        self.stop.store(true, Ordering::Relaxed);
-        if let Some(thread) = self.thread.take() {
-            assert!(thread.join().is_ok() || std::thread::panicking(), "the render thread panicked");
-        }
     }
 }
 
@@ -108,7 +94,7 @@ fn a_recorded_video_has_every_frame() {
     let server = Server::start(ServerConfig { listen: ([127, 0, 0, 1], 0).into() }, hub.clone()).expect("a free port");
     let renderer = Renderer::start(hub);
     let profile = PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join(format!("chromium-video-{}", std::process::id()));
-    let script = format!("{WEBGL_STUB}{KEEP_FILE}");
+    let script = format!("{NO_DRAWING}{KEEP_FILE}");
     let mut browser = Browser::open_with(&program, &profile, &server.url(), WINDOW_PX, &script);
     // The page may not play videos, but this test does.
     browser.call("Page.setBypassCSP", json!({"enabled": true}));

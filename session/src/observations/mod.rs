@@ -3,8 +3,9 @@
 mod map;
 
 use keyframe::{DepthMap, Keyframe};
-use kinematics::{Stamp, Transform};
+use kinematics::{Stamp, Transform, transform};
 use map::PosedDepth;
+use std::collections::btree_map::Entry;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::thread::JoinHandle;
@@ -24,9 +25,6 @@ const MAX_RENDER_FRAC: f64 = 0.1;
 const MAX_MAP_FRAC: f64 = 0.1;
 /// Depth is rendered again after this factor of training steps.
 const STEP_FACTOR: f64 = 1.5;
-/// Smaller changes of poses are not noticeable in the map.
-const NOTICEABLE_M: f64 = 1e-3;
-const NOTICEABLE_RAD: f64 = 1e-3;
 
 /// Camera and stamp of a keyframe.
 type Key = (Arc<str>, Stamp);
@@ -38,6 +36,8 @@ pub(crate) struct PosedKeyframe {
     pub(crate) pose: KeyframePose,
     /// The keyframe, if it is available. If it has depth, no depth is rendered.
     pub(crate) keyframe: Option<Arc<Keyframe>>,
+    /// Pose of its depth camera in the frame of its color camera, with corrections; the identity without depth.
+    pub(crate) color_from_depth: Transform,
 }
 
 /// What the map depends on besides the keyframes.
@@ -53,11 +53,10 @@ pub(crate) struct ModelState<'a> {
 /// Depth of a keyframe at a low resolution.
 #[derive(Clone, Debug)]
 struct KnownDepth {
-    /// The depth map; its pose is relative to the color camera.
+    /// The depth map; its pose is not used, because corrections change it.
     depth: DepthMap,
-    is_measured: bool,
-    /// Training step at which it was rendered.
-    step: u64,
+    /// Training step at which it was rendered; `None` if it was measured.
+    rendered_at: Option<u64>,
 }
 
 /// Computes the map on another thread.
@@ -68,7 +67,7 @@ pub(crate) struct ObservationPublisher {
     edits: Arc<Edits>,
     /// Whether a depth has changed since the last map.
     is_changed: bool,
-    /// Poses in the last map.
+    /// Poses of the depth in the last map.
     mapped: BTreeMap<Key, Transform>,
     task: Option<(Instant, JoinHandle<()>)>,
     next_check: Instant,
@@ -114,7 +113,7 @@ impl ObservationPublisher {
         if !Arc::ptr_eq(&self.edits, model.edits) {
             // Surfaces may have become visible.
             self.edits = Arc::clone(model.edits);
-            self.depths.retain(|_, known| known.is_measured);
+            self.depths.retain(|_, known| known.rendered_at.is_none());
         }
         let keys: BTreeSet<Key> = keyframes.iter().map(PosedKeyframe::key).collect();
         let n_before = self.depths.len();
@@ -130,11 +129,10 @@ impl ObservationPublisher {
 
     fn add_measured(&mut self, keyframes: &[PosedKeyframe]) {
         for keyframe in keyframes {
-            let Some(depth) = keyframe.keyframe.as_ref().and_then(|keyframe| measured_depth(keyframe)) else {
-                continue;
-            };
-            let std::collections::btree_map::Entry::Vacant(entry) = self.depths.entry(keyframe.key()) else { continue };
-            entry.insert(KnownDepth { depth: depth(), is_measured: true, step: u64::MAX });
+            let Some(depth) = keyframe.keyframe.as_ref().and_then(|keyframe| keyframe.depth.as_ref()) else { continue };
+            let Entry::Vacant(entry) = self.depths.entry(keyframe.key()) else { continue };
+            let stride = depth.size_px[0].div_ceil(MAX_WIDTH_PX) | 1; // Must be odd.
+            entry.insert(KnownDepth { depth: depth.subsampled(stride), rendered_at: None });
             self.is_changed = true;
         }
     }
@@ -147,8 +145,9 @@ impl ObservationPublisher {
         mut render: impl FnMut(&RenderRequest) -> Result<Picture, trainer::Error>,
     ) {
         #[expect(clippy::cast_precision_loss, reason = "steps are far below 2^52")]
-        let is_outdated = |known: &KnownDepth| !known.is_measured && step as f64 > STEP_FACTOR * known.step as f64;
-        let rendered_at = |keyframe: &PosedKeyframe| self.depths.get(&keyframe.key()).map(|known| known.step);
+        let is_outdated =
+            |known: &KnownDepth| known.rendered_at.is_some_and(|at| step as f64 > STEP_FACTOR * at as f64);
+        let rendered_at = |keyframe: &PosedKeyframe| self.depths.get(&keyframe.key())?.rendered_at;
         let mut due: Vec<_> =
             keyframes.iter().filter(|keyframe| self.depths.get(&keyframe.key()).is_none_or(is_outdated)).collect();
         due.sort_by_key(|keyframe| (rendered_at(keyframe), std::cmp::Reverse(keyframe.pose.stamp.0)));
@@ -163,7 +162,7 @@ impl ObservationPublisher {
                     return;
                 }
             };
-            self.depths.insert(keyframe.key(), KnownDepth { depth, is_measured: false, step });
+            self.depths.insert(keyframe.key(), KnownDepth { depth, rendered_at: Some(step) });
             self.is_changed = true;
             if began.elapsed() >= RENDER_TIME {
                 return;
@@ -180,15 +179,15 @@ impl ObservationPublisher {
             return;
         }
         let has_moved = |keyframe: &PosedKeyframe| match self.mapped.get(&keyframe.key()) {
-            Some(mapped) => is_noticeable(&(mapped.inverse() * keyframe.pose.world_from_camera)),
+            Some(mapped) => transform::is_noticeable(&(mapped.inverse() * keyframe.world_from_depth())),
             None => false, // It has no depth yet.
         };
         if !self.is_changed && !keyframes.iter().any(has_moved) {
             return;
         }
         let known = keyframes.iter().filter_map(|keyframe| Some((keyframe, self.depths.get(&keyframe.key())?)));
-        let observed: Vec<_> = known.clone().map(|(keyframe, known)| known.posed(&keyframe.pose)).collect();
-        self.mapped = known.clone().map(|(keyframe, _)| (keyframe.key(), keyframe.pose.world_from_camera)).collect();
+        let observed: Vec<_> = known.clone().map(|(keyframe, known)| known.posed(keyframe)).collect();
+        self.mapped = known.clone().map(|(keyframe, _)| (keyframe.key(), keyframe.world_from_depth())).collect();
         self.is_changed = false;
         let newest = known.max_by_key(|(keyframe, _)| keyframe.pose.stamp.0);
         let newest_at = newest.and_then(|(keyframe, _)| captured_at(&keyframe.pose));
@@ -206,33 +205,22 @@ impl PosedKeyframe {
     fn key(&self) -> Key {
         (Arc::clone(&self.pose.camera), self.pose.stamp)
     }
-}
 
-impl KnownDepth {
-    /// The keyframe with the current pose of its color camera.
-    fn posed(&self, pose: &KeyframePose) -> PosedDepth {
-        let world_from_camera = pose.world_from_camera * self.depth.world_from_camera;
-        PosedDepth {
-            stamp: pose.stamp,
-            depth: DepthMap { world_from_camera, ..self.depth.clone() },
-            pixel_rad: 1.0 / pose.focal_px[0],
-            is_measured: self.is_measured,
-        }
+    fn world_from_depth(&self) -> Transform {
+        self.pose.world_from_camera * self.color_from_depth
     }
 }
 
-fn is_noticeable(motion: &Transform) -> bool {
-    motion.translation.vector.norm() > NOTICEABLE_M || motion.rotation.angle() > NOTICEABLE_RAD
-}
-
-/// How to compute the depth of a keyframe at a low resolution, relative to its color camera; `None` without depth.
-fn measured_depth(keyframe: &Keyframe) -> Option<impl FnOnce() -> DepthMap> {
-    let depth = keyframe.depth.as_ref()?;
-    let camera_from_depth = keyframe.world_from_camera.inverse() * depth.world_from_camera;
-    Some(move || {
-        let stride = depth.size_px[0].div_ceil(MAX_WIDTH_PX).max(1) | 1; // Must be odd.
-        DepthMap { world_from_camera: camera_from_depth, ..depth.subsampled(stride) }
-    })
+impl KnownDepth {
+    /// The depth of a keyframe with its current pose.
+    fn posed(&self, keyframe: &PosedKeyframe) -> PosedDepth {
+        PosedDepth {
+            stamp: keyframe.pose.stamp,
+            depth: DepthMap { world_from_camera: keyframe.world_from_depth(), ..self.depth.clone() },
+            pixel_rad: 1.0 / keyframe.pose.focal_px[0],
+            is_measured: self.rendered_at.is_none(),
+        }
+    }
 }
 
 /// The request for the depth of a keyframe at a low resolution.
@@ -257,7 +245,7 @@ fn depth_request(pose: &KeyframePose, edits: &Arc<Edits>) -> RenderRequest {
     }
 }
 
-/// The depth of a rendered picture; its pose is relative to the color camera.
+/// The depth of a rendered picture.
 fn depth_map(request: &RenderRequest, picture: Picture) -> DepthMap {
     let Projection::Pinhole { focal_px, principal_px } = request.projection else {
         unreachable!("depth is requested with a pinhole")
@@ -267,6 +255,48 @@ fn depth_map(request: &RenderRequest, picture: Picture) -> DepthMap {
         focal_px,
         principal_px,
         depth_m: picture.depth_m.into(),
-        world_from_camera: Transform::identity(),
+        world_from_camera: request.world_from_camera,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use nalgebra::Vector3;
+
+    /// A keyframe, and the pose of its depth camera in the frame of its color camera.
+    fn posed(world_from_camera: Transform, color_from_depth: Transform) -> PosedKeyframe {
+        let pose = KeyframePose {
+            camera: "wrist".into(),
+            stamp: Stamp(7),
+            world_from_camera,
+            size_px: [640, 480],
+            focal_px: [600.0, 610.0],
+            principal_px: [320.0, 240.0],
+        };
+        PosedKeyframe { pose, keyframe: None, color_from_depth }
+    }
+
+    #[test]
+    fn requested_depth_has_the_field_of_view_of_the_image() {
+        let keyframe = posed(Transform::translation(1.0, 2.0, 3.0), Transform::identity());
+        let request = depth_request(&keyframe.pose, &Arc::default());
+        let Projection::Pinhole { focal_px, principal_px } = request.projection else { panic!("a pinhole") };
+        assert_eq!((request.size_px, focal_px, principal_px), ([96, 72], [90.0, 91.5], [48.0, 36.0]));
+        assert!(request.depth && request.world_from_camera == keyframe.pose.world_from_camera);
+    }
+
+    #[test]
+    fn depth_follows_corrections_of_both_cameras() {
+        let depth = depth_map(
+            &depth_request(&posed(Transform::identity(), Transform::identity()).pose, &Arc::default()),
+            Picture { size_px: [96, 72], rgba_srgb: Vec::new(), depth_m: vec![1.0; 96 * 72] },
+        );
+        let known = KnownDepth { depth, rendered_at: None };
+        let turn = Transform::rotation(Vector3::new(0.0, 0.3, 0.0));
+        let baseline = Transform::translation(0.05, 0.0, 0.0);
+        let view = known.posed(&posed(turn, baseline));
+        assert!(((turn * baseline).inverse() * view.depth.world_from_camera).translation.vector.norm() < 1e-12);
+        assert_eq!((view.stamp, view.is_measured, view.pixel_rad), (Stamp(7), true, 1.0 / 600.0));
     }
 }

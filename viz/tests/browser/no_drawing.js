@@ -20,12 +20,12 @@ HTMLCanvasElement.prototype.getContext = new Proxy(HTMLCanvasElement.prototype.g
       getError: () => 0,
       checkFramebufferStatus: () => real.FRAMEBUFFER_COMPLETE,
     };
-    canvas.stub ??= new Proxy(answers, {
+    canvas.context ??= new Proxy(answers, {
       get: (_, name) => name in answers ? answers[name]
         : name in real ? real[name]
         : String(name).startsWith('create') ? () => ({})
         : () => undefined,
     });
-    return canvas.stub;
+    return canvas.context;
   },
 });

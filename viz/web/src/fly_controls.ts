@@ -30,8 +30,8 @@ const LOOK_SCALE = 1.5;
 const MAX_PITCH = 1.55;
 /** Full speed at this distance of the thumb from where it was put down. */
 const STICK_PX = 60;
-/** Part of the scene's radius that a notch of the wheel moves. */
-const WHEEL_SHARE = 0.06;
+/** Fraction of the scene's radius that a notch of the wheel moves. */
+const WHEEL_FRAC = 0.06;
 const NOTCH_PX = 100;
 
 interface Touch {
@@ -173,6 +173,6 @@ export class FlyControls {
     if (!this.isOn) return;
     event.preventDefault();
     const notches = event.deltaMode === WheelEvent.DOM_DELTA_PIXEL ? event.deltaY / NOTCH_PX : Math.sign(event.deltaY);
-    this.shift(new THREE.Vector3(0, 0, -WHEEL_SHARE * THREE.MathUtils.clamp(notches, -3, 3)));
+    this.shift(new THREE.Vector3(0, 0, -WHEEL_FRAC * THREE.MathUtils.clamp(notches, -3, 3)));
   }
 }

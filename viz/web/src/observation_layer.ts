@@ -24,7 +24,6 @@ const TITLES: Record<Quantity, string> = {
 };
 /** Maps with a smaller fraction of the keyframes are incomplete. */
 const MIN_MAPPED_FRAC = 0.9;
-/** A shader's loop-free color scale. */
 const SCALE = COLORS.map(
   (color) => new THREE.Vector3(...[1, 3, 5].map((ix) => parseInt(color.slice(ix, ix + 2), 16) / 255)),
 );

@@ -10,7 +10,7 @@ import type { PictureRequest, SideView } from "./side_view";
 const SIZE_PX: [number, number] = [192, 96];
 /** Pause between two requests, and the fraction of the time that the server may spend on them. */
 const PAUSE_MILLIS = 150;
-const SHARE = 0.25;
+const MAX_TIME_FRAC = 0.25;
 /** Minimum time between two requests for the same eye while the model changes. */
 const REFRESH_MILLIS = 2000;
 /** An answer that is later than this is not waited for. */
@@ -76,7 +76,7 @@ export class Surroundings {
     } catch {
       if (generation === this.generation) this.fail(); // The pictures of the main view still show surfaces.
     } finally {
-      this.dueAt = performance.now() + Math.max(PAUSE_MILLIS, millis * (1 / SHARE - 1));
+      this.dueAt = performance.now() + Math.max(PAUSE_MILLIS, millis * (1 / MAX_TIME_FRAC - 1));
     }
   }
 }
