@@ -342,6 +342,17 @@ fn check_images(browser: &mut Browser) {
     save_and_restore(browser, "enlarged");
     browser.evaluate("document.querySelector('#live figure').click()");
     wait_for(browser, "a small image", |browser| browser.evaluate(height).as_u64() == Some(small));
+    let docked = "document.querySelectorAll('#docked canvas').length";
+    let dock = "document.querySelector('figure[data-camera] button').click()";
+    browser.evaluate(dock);
+    assert_eq!(browser.evaluate(docked), 1, "the image is in the side panel");
+    save_and_restore(browser, "docked");
+    browser.click("toggle-images");
+    assert_eq!(browser.evaluate("document.getElementById('docked-card').hidden"), true, "images are hidden there, too");
+    browser.click("toggle-images");
+    assert_eq!(browser.evaluate("document.getElementById('docked-card').hidden"), false);
+    browser.evaluate(dock);
+    assert_eq!(browser.evaluate(docked), 0, "the image is back in the view");
 }
 
 /// Changes a control of the settings as a user would.

@@ -21,7 +21,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 use trainer::{Projection, RenderRequest};
-use viz::{Hub, RobotState, SceneHint, Server, ServerConfig};
+use viz::{Hub, RobotState, RunResult, SceneHint, Server, ServerConfig};
 
 const WINDOW_PX: [u32; 2] = [1280, 760];
 /// Required overlap of the drawn silhouette with the exact one: intersection over union.
@@ -161,10 +161,16 @@ fn robot_silhouette_is_exact_in_front_and_behind() {
     assert_eq!(browser.evaluate("document.getElementById('robot-age').hidden"), true, "the pose is live");
     check_pivot(&mut browser, &run);
     check_views(&mut browser, &run);
+    check_frames(&mut browser, &run);
+    check_titles(&mut browser);
     check_crop(&mut browser, &run);
     check_follow(&mut browser, &run);
     drop(run);
     wait_for(&mut browser, "an outdated pose", |browser| browser.text("robot-age").contains("s old"));
+    hub.set_run_result(RunResult { folder: None, scores: String::new(), seconds: 1.0 });
+    wait_for(&mut browser, "no warning after the run", |browser| {
+        browser.evaluate("document.getElementById('robot-age').hidden") == true
+    });
     drop(browser);
     std::fs::remove_dir_all(&profile).expect("the browser has left its profile");
 }
@@ -218,6 +224,57 @@ fn check_views(browser: &mut Browser, run: &Run) {
     }
 }
 
+/// The axes of a link are drawn where it is, although they lie inside its body.
+fn check_frames(browser: &mut Browser, run: &Run) {
+    /// Colors of the x, y and z axes.
+    const COLORS: [[u8; 3]; 3] = [[0xf0, 0x71, 0x6a], [0x7b, 0xd8, 0x8f], [0x6c, 0xb6, 0xff]];
+    const MAX_DIFFERENCE: u8 = 60;
+    let request = full_request(browser, run, "a full picture", |_| true);
+    let state = robot::state(0.9);
+    let chain = Chain::from_urdf(robot::URDF, "pedestal", "tip").expect("a chain");
+    let world_from_tip = state.world_from_base * chain.forward(&[0.9, 0.2]).expect("a pose");
+    let half_length = 0.5 * 0.1 * 0.8; // Axes are 0.1 times as long as the radius of the scene.
+    let middles: Vec<[i64; 2]> = [Vector3::x(), Vector3::y(), Vector3::z()]
+        .map(|axis| project(&request, &(world_from_tip * Point3::from(axis * half_length))))
+        .into();
+    let has_axes = |shot: &image::RgbImage| {
+        let has_color = |([x, y], color): (&[i64; 2], [u8; 3])| {
+            let neighbors = (-2..=2).flat_map(|dy| (-2..=2).map(move |dx| [x + dx, y + dy]));
+            let pixels = neighbors.filter_map(|[x, y]| shot.get_pixel_checked(x.try_into().ok()?, y.try_into().ok()?));
+            let mut differences = pixels.map(|pixel| (0..3).map(|ix| pixel.0[ix].abs_diff(color[ix])).max());
+            differences.any(|difference| difference < Some(MAX_DIFFERENCE))
+        };
+        std::iter::zip(&middles, COLORS).filter(|pair| has_color(*pair)).count()
+    };
+    assert_eq!(has_axes(&canvas_shot(browser)), 0, "no axes");
+    browser.click("toggle-frames");
+    wait_for(browser, "axes", |browser| has_axes(&canvas_shot(browser)) == 3);
+    let names = "[...document.querySelectorAll('#frame-names span')].map((name) => name.textContent).join(' ')";
+    assert_eq!(browser.evaluate(names), "world_link pedestal arm tip");
+    let shot = canvas_shot(browser);
+    shot.save(PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join("page-robot-frames.png")).expect("written");
+    browser.click("toggle-frames");
+    wait_for(browser, "no axes", |browser| has_axes(&canvas_shot(browser)) == 0);
+}
+
+/// The pixel that shows a point.
+#[expect(clippy::cast_possible_truncation, reason = "pixels of a window")]
+fn project(request: &RenderRequest, point: &Point3<f64>) -> [i64; 2] {
+    let Projection::Pinhole { focal_px, principal_px } = request.projection else { panic!("a pinhole") };
+    let in_camera = request.world_from_camera.inverse_transform_point(point);
+    [0, 1].map(|axis| (focal_px[axis] * in_camera[axis] / in_camera.z + principal_px[axis]).floor() as i64)
+}
+
+/// While flying, W, A, S, D, Q and E move the eye, so titles do not show them as keys of buttons.
+fn check_titles(browser: &mut Browser) {
+    let titles =
+        "['toggle-measure', 'look-top'].map((id) => /\\((.)\\)/.exec(document.getElementById(id).title)?.[1]).join()";
+    for expected in [",T", "D,T"] {
+        browser.click("toggle-fly");
+        assert_eq!(browser.evaluate(titles), expected);
+    }
+}
+
 /// The crop box encloses the scene; dragging a handle moves one side and not the view.
 fn check_crop(browser: &mut Browser, run: &Run) {
     assert_eq!(full_request(browser, run, "a full picture", |_| true).crop, None);
@@ -228,19 +285,19 @@ fn check_crop(browser: &mut Browser, run: &Run) {
     for (corner, expected) in [crop.min_m, crop.max_m].iter().zip(expected) {
         assert!(corner.iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-6), "{crop:?}");
     }
-    let Projection::Pinhole { focal_px, principal_px } = before.projection else { panic!("a pinhole") };
-    let in_camera = before.world_from_camera.inverse_transform_point(&Point3::new(0.48, 0.0, 0.2));
-    let at = |axis: usize| focal_px[axis] * in_camera[axis] / in_camera.z + principal_px[axis];
+    let Projection::Pinhole { focal_px, .. } = before.projection else { panic!("a pinhole") };
+    let handle_m = Point3::new(0.48, 0.0, 0.2);
+    let [x, y] = project(&before, &handle_m);
     let [left, top, ..] = canvas_bounds(browser);
     #[expect(clippy::cast_possible_truncation, reason = "pixels of a window")]
-    let handle = [at(0) as i32 + left.cast_signed(), at(1) as i32 + top.cast_signed()];
+    let handle = [x as i32 + left.cast_signed(), y as i32 + top.cast_signed()];
     browser.mouse("mousePressed", handle);
     for step in 1..=8 {
         browser.mouse("mouseMoved", [handle[0] - 10 * step, handle[1]]);
     }
     browser.mouse("mouseReleased", [handle[0] - 80, handle[1]]);
     // 80 pixels at the depth of the handle.
-    let expected_x = 0.48 - 80.0 * in_camera.z / focal_px[0];
+    let expected_x = 0.48 - 80.0 * before.world_from_camera.inverse_transform_point(&handle_m).z / focal_px[0];
     let after = full_request(browser, run, "a smaller box", |request| {
         request.crop.is_some_and(|crop| (crop.max_m[0] - expected_x).abs() < 0.02)
     });

@@ -9,12 +9,15 @@ const FLY_KEYS = [
   ["Shift", "Fly mode: faster"],
 ] as const;
 
+/** A title with its key in parentheses. */
+const KEY_IN_TITLE = /^(.*?) \((.)\)(.*)$/;
+
 export function setUpHelp(): void {
   const dialog = element("help", HTMLDialogElement);
   const show = (): void => {
     const canEdit = !element("toggle-edit", HTMLButtonElement).hidden;
-    const rows = [...document.querySelectorAll<HTMLButtonElement>(".toolbar button, .layers button, .edit button")].flatMap((button) => {
-      const match = /^(.*?) \((.)\)(.*)$/.exec(button.title);
+    const rows = buttons().flatMap((button) => {
+      const match = KEY_IN_TITLE.exec(fullTitle(button));
       const isAvailable = !button.hidden && (!button.closest(".edit") || canEdit);
       return match && isAvailable ? [row(match[2]!, match[1]! + match[3]!)] : [];
     });
@@ -28,6 +31,27 @@ export function setUpHelp(): void {
     if (event.key === "?") show();
   });
   dialog.addEventListener("click", () => dialog.close());
+}
+
+/** Shows the keys in the titles of buttons again, or hides those that have another meaning while flying. */
+export function showKeysInTitles(isShown: boolean): void {
+  for (const button of buttons()) {
+    const title = fullTitle(button);
+    const [, before, key, after] = KEY_IN_TITLE.exec(title) ?? [];
+    const isFlyKey = key !== undefined && FLY_KEYS.some(([keys]) => keys.split(" ").includes(key));
+    if (!isFlyKey || (button.title !== title && button.title !== before! + after!)) continue; // A reason is shown.
+    button.dataset.title = title;
+    button.title = isShown ? title : before! + after!;
+  }
+}
+
+function buttons(): HTMLButtonElement[] {
+  return [...document.querySelectorAll<HTMLButtonElement>(".toolbar button, .layers button, .edit button")];
+}
+
+/** The title that may at times be replaced by another one. */
+function fullTitle(button: HTMLButtonElement): string {
+  return button.dataset.title ?? button.title;
 }
 
 function row(key: string, meaning: string): HTMLElement[] {

@@ -1,4 +1,4 @@
-// The current camera images, as thumbnails in the corner. A click on an image enlarges it.
+// The current camera images, as thumbnails in the corner or docked in the side panel. A click on a thumbnail enlarges it.
 
 import { element } from "./element";
 import type { LiveImageHeader } from "./protocol";
@@ -14,6 +14,7 @@ interface Slot {
   canvas: HTMLCanvasElement;
   caption: HTMLElement;
   age: HTMLElement;
+  dock: HTMLButtonElement;
   capturedMillis: number;
   waiting: { header: LiveImageHeader; jpeg: Uint8Array<ArrayBuffer> } | null;
   isDecoding: boolean;
@@ -22,6 +23,7 @@ interface Slot {
 export class LiveImages {
   /** Cameras whose image has been enlarged, and whether it still is. */
   readonly resized = new Map<string, boolean>();
+  private isEnabled = true;
   private readonly slots = new Map<string, Slot>();
 
   constructor(
@@ -63,6 +65,42 @@ export class LiveImages {
     this.showAges();
   }
 
+  /** Whether the images are shown. */
+  set enabled(enabled: boolean) {
+    element("live").hidden = !enabled;
+    this.isEnabled = enabled;
+    this.showDock();
+  }
+
+  /** Moves all images to the view. */
+  undockAll(): void {
+    for (const slot of this.slots.values()) this.setDocked(slot, false);
+  }
+
+  private setDocked(slot: Slot, isDocked: boolean): void {
+    const { figure, dock } = slot;
+    dock.textContent = isDocked ? "⇤" : "⇥";
+    dock.title = isDocked ? "Move this image to the view" : "Move this image to the side panel";
+    dock.ariaLabel = dock.title;
+    const parent = element(isDocked ? "docked" : "live");
+    if (figure.parentElement === parent) return;
+    parent.append(figure);
+    if (isDocked) this.setEnlarged(figure, false);
+    this.showDock();
+  }
+
+  private setEnlarged(figure: HTMLElement, isEnlarged: boolean): void {
+    if (figure.classList.contains("enlarged") === isEnlarged) return;
+    figure.classList.toggle("enlarged", isEnlarged);
+    this.resized.set(figure.dataset.camera!, isEnlarged);
+    this.onResize();
+  }
+
+  /** The card in the side panel is visible if it contains images. */
+  private showDock(): void {
+    element("docked-card").hidden = !this.isEnabled || element("docked").childElementCount === 0;
+  }
+
   private add(camera: string): Slot {
     const figure = document.createElement("figure");
     const canvas = document.createElement("canvas");
@@ -70,16 +108,20 @@ export class LiveImages {
     const name = document.createElement("b");
     const age = document.createElement("span");
     name.textContent = camera;
-    caption.append(name, age);
+    const dock = document.createElement("button");
+    caption.append(name, age, dock);
     figure.append(canvas, caption);
     figure.dataset.camera = camera;
     figure.addEventListener("click", () => {
-      const isEnlarged = figure.classList.toggle("enlarged");
-      this.resized.set(camera, isEnlarged);
-      this.onResize();
+      if (!isDocked()) this.setEnlarged(figure, !figure.classList.contains("enlarged"));
     });
-    element("live").append(figure);
-    const slot: Slot = { figure, canvas, caption, age, capturedMillis: -Infinity, waiting: null, isDecoding: false };
+    dock.addEventListener("click", (event) => {
+      event.stopPropagation(); // It is not a click on the image.
+      this.setDocked(slot, !isDocked());
+    });
+    const slot: Slot = { figure, canvas, caption, age, dock, capturedMillis: -Infinity, waiting: null, isDecoding: false };
+    const isDocked = (): boolean => figure.parentElement === element("docked");
+    this.setDocked(slot, false);
     this.slots.set(camera, slot);
     return slot;
   }

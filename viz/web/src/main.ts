@@ -6,7 +6,7 @@ import { Connection } from "./connection";
 import { EditControls } from "./edit_controls";
 import { element } from "./element";
 import { showGuidance } from "./guidance";
-import { setUpHelp } from "./help";
+import { setUpHelp, showKeysInTitles } from "./help";
 import { KeyframeList } from "./keyframe_list";
 import { LinkReadout } from "./link_readout";
 import { LiveImages } from "./live_images";
@@ -121,7 +121,8 @@ function receiveText(message: TextMessage): void {
       showStatus(message);
       runControls.show(message);
       banner.setRunResult(message.result);
-      showGuidance(message.guidance, banner, subscriptions);
+      showGuidance(message.guidance, banner, subscriptions, liveImages);
+      robotAge.hasEnded = banner.isFinished;
       break;
     case "scene":
       view.setScene(message);
@@ -274,7 +275,10 @@ function action(id: string, key: string, act: () => void): void {
   });
 }
 
-toggle("toggle-fly", "y", (isOn) => (view.flies = isOn));
+toggle("toggle-fly", "y", (isOn) => {
+  view.flies = isOn;
+  showKeysInTitles(!isOn);
+});
 action("reset-view", "r", () => view.reset());
 action("full-screen", "u", () => {
   if (document.fullscreenElement) void document.exitFullscreen();
@@ -302,7 +306,7 @@ toggle("toggle-keyframes", "k", (isOn) => (view.overlays.showsKeyframes = isOn))
 toggle("toggle-crop", "x", (isOn) => (view.crop.enabled = isOn));
 toggle("toggle-measure", "d", (isOn) => (view.measure.enabled = isOn));
 toggle("toggle-images", "i", (isOn) => {
-  element("live").hidden = !isOn;
+  liveImages.enabled = isOn;
   subscriptions.images = isOn;
 });
 const switchPanel = panels({ "toggle-layers": "layers", "toggle-settings": "settings", "toggle-edit": "edit" });
@@ -337,6 +341,7 @@ for (const { id, key, quantity } of TINTS) {
   });
 }
 toggle("toggle-robot", "b", (isOn) => (view.robot.enabled = isOn));
+toggle("toggle-frames", "h", (isOn) => (view.frames.enabled = isOn));
 toggle("toggle-occlude", "o", (isOn) => (view.occlusion.enabled = isOn));
 
 function frame(): void {

@@ -8,6 +8,7 @@ import { CropBox } from "./crop_box";
 import { type DepthMap, PictureDepthMap } from "./depth_map";
 import { EyeGuard, type Viewpoint } from "./eye_guard";
 import { FlyControls } from "./fly_controls";
+import { FrameLayer } from "./frame_layer";
 import { LocalModel } from "./local_model";
 import { MeasureTool } from "./measure";
 import { ObservationLayer } from "./observation_layer";
@@ -41,6 +42,7 @@ export class OrbitView {
   readonly overlays = new Overlays(this.occlusion);
   readonly points = new PointsLayer(this.occlusion);
   readonly scans = new ScanLayer(this.occlusion);
+  readonly frames = new FrameLayer();
   readonly robot = new RobotLayer(this.occlusion, () => this.changed());
   readonly local = new LocalModel(this.observations, () => this.changed());
   private readonly camera = new THREE.PerspectiveCamera(VERTICAL_FOV_DEGREES, 1, 0.01, 200);
@@ -104,7 +106,7 @@ export class OrbitView {
     light.position.set(-0.4, 0.7, 1); // Over the viewer's left shoulder.
     this.camera.add(light);
     this.world.add(this.camera, new THREE.HemisphereLight(0xffffff, 0x5a6472, 1.7), this.overlays.root, this.robot.root);
-    this.world.add(this.points.root, this.scans.root);
+    this.world.add(this.points.root, this.scans.root, this.frames.root);
     canvas.addEventListener("dblclick", (event) => this.pivotAt(event.offsetX, event.offsetY));
     new ResizeObserver(() => {
       this.fit();
@@ -120,6 +122,7 @@ export class OrbitView {
     if (!isNew) return;
     this.isStale = true;
     this.overlays.setScene(scene);
+    this.frames.radiusM = scene.radius_m;
     this.crop.setScene(scene);
     this.camera.near = Math.max(0.005 * scene.radius_m, 0.005);
     this.camera.far = 400 * this.camera.near + 40 * scene.radius_m;
@@ -424,6 +427,10 @@ export class OrbitView {
     this.occlusion.local = needsSplatDepth ? this.splatDepth(view) : null;
     this.crop.update();
     this.measure.update();
+    if (this.frames.isVisible) {
+      const cameras = [...this.overlays.livePoses].map(([name, pose]) => [`camera ${name}`, pose] as const);
+      this.frames.update(new Map([...this.robot.linkPoses(), ...cameras]), this.camera);
+    }
     this.renderer.clear();
     this.renderer.render(this.background, this.camera);
     if (!hasDepthBuffer || !this.occlusion.enabled) this.renderer.clearDepth();

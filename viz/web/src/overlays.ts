@@ -18,6 +18,8 @@ export class Overlays {
   private readonly cameras = new THREE.Group();
   private readonly keyframes: THREE.LineSegments;
   private readonly live = new Map<string, THREE.LineSegments>();
+  /** Poses of the live cameras. */
+  readonly livePoses = new Map<string, THREE.Matrix4>();
   private frustumDepth = 0.06;
   private posed: (PosedCamera | NumberedKeyframe)[] = [];
 
@@ -101,6 +103,7 @@ export class Overlays {
       this.cameras.add(drawn);
     }
     drawn.name = poseKey;
+    this.livePoses.set(camera.camera, worldFromCamera(camera.world_from_camera));
     setLines(drawn, frustum(camera, 1.6 * this.frustumDepth));
     return true;
   }
@@ -118,8 +121,8 @@ function setLines(target: THREE.LineSegments, points: THREE.Vector3[]): void {
   target.geometry = new THREE.BufferGeometry().setFromPoints(points);
 }
 
-/** x red, y green, z blue. */
-function axes(length: number): THREE.LineSegments {
+/** Axes of a frame: x red, y green, z blue. */
+export function axes(length: number): THREE.LineSegments {
   const helper = new THREE.AxesHelper(length);
   helper.setColors(0xf0716a, 0x7bd88f, 0x6cb6ff);
   helper.renderOrder = 1;

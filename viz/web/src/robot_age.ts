@@ -9,6 +9,8 @@ import type { ServerClock } from "./server_clock";
 const LIVE_MILLIS = 500;
 
 export class RobotAge {
+  /** Whether the run has ended, so that an outdated pose is expected. */
+  hasEnded = false;
   private capturedMillis: number | null = null;
 
   constructor(private readonly robot: RobotLayer, private readonly clock: ServerClock) {
@@ -30,7 +32,7 @@ export class RobotAge {
     const age = this.clock.age(this.capturedMillis) ?? Infinity;
     const isLive = age <= LIVE_MILLIS;
     this.robot.setOutdated(!isLive);
-    label.hidden = isLive;
+    label.hidden = isLive || this.hasEnded;
     if (!isLive) label.textContent = Number.isFinite(age) ? `robot ${(age / 1000).toFixed(1)} s old` : "robot not live";
   }
 }

@@ -117,6 +117,11 @@ export class RobotLayer {
     return link ? new THREE.Vector3().setFromMatrixPosition(link.matrixWorld) : null;
   }
 
+  /** Poses of the links in the world; none if the state is unknown. */
+  linkPoses(): [string, THREE.Matrix4][] {
+    return this.hasState ? [...this.links].map(([name, link]) => [name, link.matrixWorld]) : [];
+  }
+
   /** Draws the robot faintly while its state is outdated. */
   setOutdated(isOutdated: boolean): void {
     if (isOutdated === this.isOutdated) return;

@@ -16,7 +16,9 @@ export class RunControls {
     element("pause").addEventListener("click", () => {
       connection.send({ type: "control", action: this.isPaused ? "resume" : "pause" });
     });
-    element("save").addEventListener("click", () => connection.send({ type: "control", action: "save" }));
+    for (const id of ["save", "save-edits"]) {
+      element(id).addEventListener("click", () => connection.send({ type: "control", action: "save" }));
+    }
   }
 
   show(status: Status): void {
@@ -25,7 +27,9 @@ export class RunControls {
     const isRunning = CONTROLLABLE.includes(status.state);
     // Undoing all edits must be saved, too.
     const canSaveEdits = SAVED.includes(status.state) && this.connection.supports("edit");
-    element("controls").hidden = !this.connection.supports("control") || !(isRunning || canSaveEdits);
+    const canControl = this.connection.supports("control");
+    element("controls").hidden = !canControl || !(isRunning || canSaveEdits);
+    element("save-edits").hidden = !canControl || !canSaveEdits;
     element("pause").hidden = !isRunning;
     element("save").textContent = isRunning ? "Save checkpoint" : "Save edits";
     element("save").title = isRunning ? "Write a checkpoint now" : "Save the edits in the folder of the model";
