@@ -99,3 +99,15 @@ fn forbidden_dependency_is_detected() {
         ["shortcut has no rule in this test", "trainer -> anyhow, which only fieldrig may use", "trainer -> drivers"];
     assert_eq!(violations(&dependencies), expected);
 }
+
+/// Without an entry, a crate would be compiled like a dependency: slowly, and without line numbers in backtraces.
+#[test]
+fn every_crate_has_a_development_profile() {
+    let manifest = std::fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/Cargo.toml")).expect("a manifest");
+    let manifest: toml::Table = manifest.parse().expect("TOML");
+    let profiles = manifest["profile"]["dev"]["package"].as_table().expect("a table");
+    for (name, _) in ALLOWED {
+        let debug = profiles.get(name).and_then(|profile| profile.get("debug")?.as_str());
+        assert_eq!(debug, Some("line-tables-only"), "the profile of {name}");
+    }
+}

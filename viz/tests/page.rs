@@ -342,10 +342,16 @@ fn check_images(browser: &mut Browser) {
     save_and_restore(browser, "enlarged");
     browser.evaluate("document.querySelector('#live figure').click()");
     wait_for(browser, "a small image", |browser| browser.evaluate(height).as_u64() == Some(small));
+    // Images in the side panel are small.
+    browser.evaluate("document.querySelector('#live figure').click()");
+    wait_for(browser, "a larger image", |browser| browser.evaluate(height).as_u64() == Some(480));
     let docked = "document.querySelectorAll('#docked canvas').length";
     let dock = "document.querySelector('figure[data-camera] button').click()";
     browser.evaluate(dock);
     assert_eq!(browser.evaluate(docked), 1, "the image is in the side panel");
+    wait_for(browser, "a small image in the side panel", |browser| {
+        browser.evaluate("document.querySelector('#docked canvas').height").as_u64() == Some(small)
+    });
     save_and_restore(browser, "docked");
     browser.click("toggle-images");
     assert_eq!(browser.evaluate("document.getElementById('docked-card').hidden"), true, "images are hidden there, too");
@@ -521,7 +527,9 @@ fn page_shows_connection_loss_and_run_result() {
     browser.evaluate("record.isLive = false");
     proxy.restore();
     wait_for(&mut browser, "the return", |browser| browser.text("connection").contains("connected"));
+    let returned_at = Instant::now();
     wait_for(&mut browser, "the end of the outage", |browser| browser.text("banner").is_empty());
+    assert!(returned_at.elapsed() < Duration::from_secs(5), "the banner stayed for {:?}", returned_at.elapsed());
     let shown_after = browser.evaluate("record.shownAfter").as_f64().expect("the loss was shown");
     assert!(shown_after < MAX_LOSS_DISPLAY_MILLIS, "the lost connection was shown after {shown_after} ms");
     assert_eq!(browser.evaluate("record.isLive"), false, "an image from before the cut was labeled live");

@@ -166,7 +166,10 @@ fn robot_silhouette_is_exact_in_front_and_behind() {
     check_crop(&mut browser, &run);
     check_follow(&mut browser, &run);
     drop(run);
-    wait_for(&mut browser, "an outdated pose", |browser| browser.text("robot-age").contains("s old"));
+    wait_for(&mut browser, "an outdated pose", |browser| {
+        browser.text("robot-age").contains("s old")
+            && browser.evaluate("document.getElementById('robot-age').hidden") == false
+    });
     hub.set_run_result(RunResult { folder: None, scores: String::new(), seconds: 1.0 });
     wait_for(&mut browser, "no warning after the run", |browser| {
         browser.evaluate("document.getElementById('robot-age').hidden") == true
@@ -237,7 +240,7 @@ fn check_frames(browser: &mut Browser, run: &Run) {
     let middles: Vec<[i64; 2]> = [Vector3::x(), Vector3::y(), Vector3::z()]
         .map(|axis| project(&request, &(world_from_tip * Point3::from(axis * half_length))))
         .into();
-    let has_axes = |shot: &image::RgbImage| {
+    let n_visible_axes = |shot: &image::RgbImage| {
         let has_color = |([x, y], color): (&[i64; 2], [u8; 3])| {
             let neighbors = (-2..=2).flat_map(|dy| (-2..=2).map(move |dx| [x + dx, y + dy]));
             let pixels = neighbors.filter_map(|[x, y]| shot.get_pixel_checked(x.try_into().ok()?, y.try_into().ok()?));
@@ -246,15 +249,25 @@ fn check_frames(browser: &mut Browser, run: &Run) {
         };
         std::iter::zip(&middles, COLORS).filter(|pair| has_color(*pair)).count()
     };
-    assert_eq!(has_axes(&canvas_shot(browser)), 0, "no axes");
+    assert_eq!(n_visible_axes(&canvas_shot(browser)), 0, "no axes");
     browser.click("toggle-frames");
-    wait_for(browser, "axes", |browser| has_axes(&canvas_shot(browser)) == 3);
+    wait_for(browser, "axes", |browser| n_visible_axes(&canvas_shot(browser)) == 3);
     let names = "[...document.querySelectorAll('#frame-names span')].map((name) => name.textContent).join(' ')";
     assert_eq!(browser.evaluate(names), "world_link pedestal arm tip");
+    let places = "[...document.querySelectorAll('#frame-names span:not([hidden])')].map((name) => \
+                  { const b = name.getBoundingClientRect(); return [b.left, b.top, b.right, b.bottom]; })";
+    let places: Vec<[f64; 4]> = serde_json::from_value(browser.evaluate(places)).expect("rectangles");
+    assert_eq!(places.len(), 4);
+    for (ix, a) in places.iter().enumerate() {
+        for b in &places[..ix] {
+            let overlaps = a[0] < b[2] - 1.0 && b[0] < a[2] - 1.0 && a[1] < b[3] - 1.0 && b[1] < a[3] - 1.0;
+            assert!(!overlaps, "names cover each other: {places:?}");
+        }
+    }
     let shot = canvas_shot(browser);
     shot.save(PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join("page-robot-frames.png")).expect("written");
     browser.click("toggle-frames");
-    wait_for(browser, "no axes", |browser| has_axes(&canvas_shot(browser)) == 0);
+    wait_for(browser, "no axes", |browser| n_visible_axes(&canvas_shot(browser)) == 0);
 }
 
 /// The pixel that shows a point.
@@ -269,7 +282,7 @@ fn project(request: &RenderRequest, point: &Point3<f64>) -> [i64; 2] {
 fn check_titles(browser: &mut Browser) {
     let titles =
         "['toggle-measure', 'look-top'].map((id) => /\\((.)\\)/.exec(document.getElementById(id).title)?.[1]).join()";
-    for expected in [",T", "D,T"] {
+    for expected in [",,T", "D,W,T"] {
         browser.click("toggle-fly");
         assert_eq!(browser.evaluate(titles), expected);
     }

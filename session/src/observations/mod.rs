@@ -37,6 +37,7 @@ pub(crate) struct PosedKeyframe {
     /// The keyframe, if it is available. If it has depth, no depth is rendered.
     pub(crate) keyframe: Option<Arc<Keyframe>>,
     /// Pose of its depth camera in the frame of its color camera, with corrections; the identity without depth.
+    /// Corrections of the focal lengths and of the scale of depth are not applied to it.
     pub(crate) color_from_depth: Transform,
 }
 
@@ -293,10 +294,12 @@ mod tests {
             Picture { size_px: [96, 72], rgba_srgb: Vec::new(), depth_m: vec![1.0; 96 * 72] },
         );
         let known = KnownDepth { depth, rendered_at: None };
-        let turn = Transform::rotation(Vector3::new(0.0, 0.3, 0.0));
-        let baseline = Transform::translation(0.05, 0.0, 0.0);
-        let view = known.posed(&posed(turn, baseline));
-        assert!(((turn * baseline).inverse() * view.depth.world_from_camera).translation.vector.norm() < 1e-12);
-        assert_eq!((view.stamp, view.is_measured, view.pixel_rad), (Stamp(7), true, 1.0 / 600.0));
+        let world_from_camera = Transform::rotation(Vector3::new(0.0, 0.3, 0.0));
+        let color_from_depth =
+            Transform::translation(0.05, 0.0, 0.0) * Transform::rotation(Vector3::new(0.1, 0.0, 0.2));
+        let depth = known.posed(&posed(world_from_camera, color_from_depth));
+        let error = (world_from_camera * color_from_depth).inverse() * depth.depth.world_from_camera;
+        assert!(error.translation.vector.norm() < 1e-12 && error.rotation.angle() < 1e-7, "{error}");
+        assert_eq!((depth.stamp, depth.is_measured, depth.pixel_rad), (Stamp(7), true, 1.0 / 600.0));
     }
 }

@@ -2,13 +2,16 @@
 
 import * as THREE from "three";
 import { element } from "./element";
-import { axes } from "./overlays";
+import { axes, type PosedFrame } from "./overlays";
 
 /** Length of the axes, relative to the radius of the scene. */
 const AXIS_LENGTH = 0.1;
 /** Names keep this distance from each other, pixels. */
 const NAME_HEIGHT_PX = 15;
 const NAME_WIDTH_PX = 110;
+
+/** Opacity while the pose is outdated. */
+const OUTDATED_OPACITY = 0.35;
 
 interface Frame {
   axes: THREE.LineSegments;
@@ -39,12 +42,15 @@ export class FrameLayer {
     this.axisLengthM = AXIS_LENGTH * radiusM;
   }
 
-  /** Draws these frames, each with its pose in the world, and removes all others. Names are placed for this camera. */
-  update(posed: Map<string, THREE.Matrix4>, camera: THREE.PerspectiveCamera): void {
+  /** Draws these frames by name, and removes all others. Names are placed for this camera. */
+  update(posed: Map<string, PosedFrame>, camera: THREE.PerspectiveCamera): void {
     for (const [name, frame] of this.frames) if (!posed.has(name)) this.remove(name, frame);
-    for (const [name, worldFromFrame] of posed) {
+    for (const [name, { worldFromFrame, isOutdated }] of posed) {
       const frame = this.frames.get(name) ?? this.add(name);
       frame.axes.matrix.copy(worldFromFrame).scale(new THREE.Vector3().setScalar(this.axisLengthM));
+      const opacity = isOutdated ? OUTDATED_OPACITY : 1;
+      (frame.axes.material as THREE.LineBasicMaterial).opacity = opacity;
+      frame.name.style.opacity = String(opacity);
     }
     this.placeNames(camera);
   }
@@ -67,26 +73,42 @@ export class FrameLayer {
 
   private remove(name: string, frame: Frame): void {
     frame.axes.geometry.dispose();
+    (frame.axes.material as THREE.LineBasicMaterial).dispose();
     frame.axes.removeFromParent();
     frame.name.remove();
     this.frames.delete(name);
   }
 
-  /** Moves names down that would cover others. */
+  /** Places the visible names, in whole pixels. */
   private placeNames(camera: THREE.PerspectiveCamera): void {
     const { clientWidth, clientHeight } = this.names;
-    const placed: [number, number][] = [];
-    for (const frame of this.frames.values()) {
-      const at = new THREE.Vector3().setFromMatrixPosition(frame.axes.matrix).project(camera);
-      const x = 0.5 * clientWidth * (1 + at.x);
-      let y = 0.5 * clientHeight * (1 - at.y);
-      frame.name.hidden = at.z > 1; // Behind the viewer.
-      if (frame.name.hidden) continue;
-      const covers = ([otherX, otherY]: [number, number]): boolean =>
-        Math.abs(otherX - x) < NAME_WIDTH_PX && Math.abs(otherY - y) < NAME_HEIGHT_PX;
-      for (let other = placed.find(covers); other; other = placed.find(covers)) y = other[1] + NAME_HEIGHT_PX;
-      placed.push([x, y]);
-      frame.name.style.translate = `${x.toFixed(1)}px ${y.toFixed(1)}px`;
+    const visible: { name: HTMLElement; at: Pixel }[] = [];
+    for (const { axes, name } of this.frames.values()) {
+      const { x, y, z } = new THREE.Vector3().setFromMatrixPosition(axes.matrix).project(camera);
+      // Points behind the viewer or outside of the view.
+      name.hidden = !(Math.abs(x) <= 1 && Math.abs(y) <= 1 && Math.abs(z) <= 1);
+      if (name.hidden) continue;
+      visible.push({ name, at: [Math.round(0.5 * clientWidth * (1 + x)), Math.round(0.5 * clientHeight * (1 - y))] });
     }
+    const placed = withoutOverlaps(visible.map(({ at }) => at));
+    visible.forEach(({ name }, ix) => {
+      const [x, y] = placed[ix]!;
+      name.style.translate = `${x}px ${y}px`;
+    });
   }
+}
+
+type Pixel = [number, number];
+
+/** Moves places down that would cover earlier ones. Places are whole numbers, so that sums are exact. */
+function withoutOverlaps(places: Pixel[]): Pixel[] {
+  const placed: Pixel[] = [];
+  for (const [x, top] of places) {
+    let y = top;
+    const covers = ([otherX, otherY]: Pixel): boolean =>
+      Math.abs(otherX - x) < NAME_WIDTH_PX && Math.abs(otherY - y) < NAME_HEIGHT_PX;
+    for (let other = placed.find(covers); other; other = placed.find(covers)) y = other[1] + NAME_HEIGHT_PX;
+    placed.push([x, y]);
+  }
+  return placed;
 }

@@ -11,7 +11,7 @@ export function showGuidance(
   subscriptions: Subscriptions,
   images: LiveImages,
 ): void {
-  if (guidance) images.undockAll(); // The side panel is hidden.
+  images.canDock = guidance === undefined; // The side panel is hidden.
   document.body.classList.toggle("guided", guidance !== undefined);
   banner.setGuidance(guidance ?? null);
   subscriptions.largeImages = guidance !== undefined;

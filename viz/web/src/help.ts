@@ -49,7 +49,7 @@ function buttons(): HTMLButtonElement[] {
   return [...document.querySelectorAll<HTMLButtonElement>(".toolbar button, .layers button, .edit button")];
 }
 
-/** The title that may at times be replaced by another one. */
+/** The original title, even while another one is shown. */
 function fullTitle(button: HTMLButtonElement): string {
   return button.dataset.title ?? button.title;
 }

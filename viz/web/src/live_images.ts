@@ -15,6 +15,8 @@ interface Slot {
   caption: HTMLElement;
   age: HTMLElement;
   dock: HTMLButtonElement;
+  /** Whether the user has moved the image to the side panel. */
+  isDocked: boolean;
   capturedMillis: number;
   waiting: { header: LiveImageHeader; jpeg: Uint8Array<ArrayBuffer> } | null;
   isDecoding: boolean;
@@ -24,6 +26,7 @@ export class LiveImages {
   /** Cameras whose image has been enlarged, and whether it still is. */
   readonly resized = new Map<string, boolean>();
   private isEnabled = true;
+  private hasDock = true;
   private readonly slots = new Map<string, Slot>();
 
   constructor(
@@ -72,19 +75,22 @@ export class LiveImages {
     this.showDock();
   }
 
-  /** Moves all images to the view. */
-  undockAll(): void {
-    for (const slot of this.slots.values()) this.setDocked(slot, false);
+  /** Whether images can be in the side panel. Otherwise, all of them are in the view. */
+  set canDock(canDock: boolean) {
+    if (canDock === this.hasDock) return;
+    this.hasDock = canDock;
+    for (const slot of this.slots.values()) this.place(slot);
   }
 
-  private setDocked(slot: Slot, isDocked: boolean): void {
-    const { figure, dock } = slot;
+  /** Moves an image to where it belongs, and describes its button. */
+  private place({ figure, dock, isDocked }: Slot): void {
+    const parent = element(isDocked && this.hasDock ? "docked" : "live");
     dock.textContent = isDocked ? "⇤" : "⇥";
     dock.title = isDocked ? "Move this image to the view" : "Move this image to the side panel";
-    dock.ariaLabel = dock.title;
-    const parent = element(isDocked ? "docked" : "live");
-    if (figure.parentElement === parent) return;
+    dock.ariaLabel = `Move the image of ${figure.dataset.camera} to the ${isDocked ? "view" : "side panel"}`;
+    const hadFocus = document.activeElement === dock;
     parent.append(figure);
+    if (hadFocus) dock.focus();
     if (isDocked) this.setEnlarged(figure, false);
     this.showDock();
   }
@@ -113,15 +119,15 @@ export class LiveImages {
     figure.append(canvas, caption);
     figure.dataset.camera = camera;
     figure.addEventListener("click", () => {
-      if (!isDocked()) this.setEnlarged(figure, !figure.classList.contains("enlarged"));
+      if (!slot.isDocked) this.setEnlarged(figure, !figure.classList.contains("enlarged"));
     });
     dock.addEventListener("click", (event) => {
       event.stopPropagation(); // It is not a click on the image.
-      this.setDocked(slot, !isDocked());
+      slot.isDocked = !slot.isDocked;
+      this.place(slot);
     });
-    const slot: Slot = { figure, canvas, caption, age, dock, capturedMillis: -Infinity, waiting: null, isDecoding: false };
-    const isDocked = (): boolean => figure.parentElement === element("docked");
-    this.setDocked(slot, false);
+    const slot: Slot = { figure, canvas, caption, age, dock, isDocked: false, capturedMillis: -Infinity, waiting: null, isDecoding: false };
+    this.place(slot);
     this.slots.set(camera, slot);
     return slot;
   }

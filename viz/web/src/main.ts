@@ -65,6 +65,7 @@ const connection = new Connection(`${location.protocol === "https:" ? "wss" : "w
     if (state === "open" && !wasOpen) {
       view.picture.forget();
       liveImages.forget();
+      view.overlays.forgetLive();
       robotAge.forget();
       scheduler.restart();
       shownLatency.forget();
@@ -114,6 +115,7 @@ function receiveText(message: TextMessage): void {
     case "hello":
       stages = message.default_stages;
       showRole(message.role);
+      showKeysInTitles(!isPressed("toggle-fly"));
       break;
     case "status":
       latestStatus = message;
@@ -253,10 +255,14 @@ async function showPicture(header: PictureHeader, payload: Uint8Array<ArrayBuffe
   });
 }
 
+function isPressed(id: string): boolean {
+  return element(id).getAttribute("aria-pressed") === "true";
+}
+
 function toggle(id: string, key: string, apply: (isOn: boolean) => void): void {
   const button = element(id, HTMLButtonElement);
   const flip = (): void => {
-    const isOn = button.getAttribute("aria-pressed") !== "true";
+    const isOn = !isPressed(id);
     button.setAttribute("aria-pressed", String(isOn));
     apply(isOn);
     view.changed();

@@ -428,7 +428,7 @@ export class OrbitView {
     this.crop.update();
     this.measure.update();
     if (this.frames.isVisible) {
-      const cameras = [...this.overlays.livePoses].map(([name, pose]) => [`camera ${name}`, pose] as const);
+      const cameras = this.overlays.cameraPoses().map(([name, posed]) => [`camera ${name}`, posed] as const);
       this.frames.update(new Map([...this.robot.linkPoses(), ...cameras]), this.camera);
     }
     this.renderer.clear();

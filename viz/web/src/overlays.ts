@@ -12,14 +12,20 @@ const OLD_COLOR = new THREE.Color(0x9aa4b2);
 const AGE_SECS = 10;
 const LIVE_COLOR = 0x4cc2a6;
 
+/** A pose in the world. */
+export interface PosedFrame {
+  worldFromFrame: THREE.Matrix4;
+  isOutdated: boolean;
+}
+
 export class Overlays {
   readonly root = new THREE.Group();
   private readonly ground = new THREE.Group();
   private readonly cameras = new THREE.Group();
   private readonly keyframes: THREE.LineSegments;
   private readonly live = new Map<string, THREE.LineSegments>();
-  /** Poses of the live cameras. */
-  readonly livePoses = new Map<string, THREE.Matrix4>();
+  private readonly livePoses = new Map<string, THREE.Matrix4>();
+  private isLive = true;
   private frustumDepth = 0.06;
   private posed: (PosedCamera | NumberedKeyframe)[] = [];
 
@@ -87,9 +93,27 @@ export class Overlays {
 
   /** Sets whether the poses of the live cameras are current; if not, they are drawn faintly. */
   setLive(isLive: boolean): void {
+    this.isLive = isLive;
     for (const drawn of this.live.values()) {
       (drawn.material as THREE.LineBasicMaterial).opacity = isLive ? 1 : 0.3;
     }
+  }
+
+  /** Removes the live cameras: a new server may have others. */
+  forgetLive(): void {
+    for (const drawn of this.live.values()) {
+      drawn.geometry.dispose();
+      (drawn.material as THREE.LineBasicMaterial).dispose();
+      drawn.removeFromParent();
+    }
+    this.live.clear();
+    this.livePoses.clear();
+  }
+
+  /** Poses of the live cameras in the world. */
+  cameraPoses(): [string, PosedFrame][] {
+    const isOutdated = !this.isLive;
+    return [...this.livePoses].map(([name, worldFromFrame]) => [name, { worldFromFrame, isOutdated }]);
   }
 
   /** Draws a camera at its current pose; returns whether the pose changed. */

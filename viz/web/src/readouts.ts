@@ -18,7 +18,7 @@ export class Readouts {
     text("primitives", count(model.primitives));
     text("bytes", bytesText(model.bytes));
     text("keyframes", count(status.keyframes));
-    // The saved model of a viewer has only accepted keyframes.
+    // A saved model lists only accepted keyframes.
     for (const id of ["rejected-label", "rejected-total"]) element(id).hidden = status.state === "viewing";
     const reasons = Object.entries(status.rejected).sort((a, b) => b[1] - a[1]);
     text("rejected-total", count(reasons.reduce((sum, [, n]) => sum + n, 0)));

@@ -6,6 +6,7 @@ import { OBJLoader } from "three/examples/jsm/loaders/OBJLoader.js";
 import { STLLoader } from "three/examples/jsm/loaders/STLLoader.js";
 import { worldFromCamera as matrixOf } from "./convention";
 import { type Occlusion, SOLID } from "./occlusion";
+import type { PosedFrame } from "./overlays";
 import type { Robot, RobotJoint, RobotShape, RobotState } from "./protocol";
 
 /** Color of shapes without one. */
@@ -118,8 +119,10 @@ export class RobotLayer {
   }
 
   /** Poses of the links in the world; none if the state is unknown. */
-  linkPoses(): [string, THREE.Matrix4][] {
-    return this.hasState ? [...this.links].map(([name, link]) => [name, link.matrixWorld]) : [];
+  linkPoses(): [string, PosedFrame][] {
+    const { isOutdated } = this;
+    const posed = ({ matrixWorld: worldFromFrame }: THREE.Group): PosedFrame => ({ worldFromFrame, isOutdated });
+    return this.hasState ? [...this.links].map(([name, link]) => [name, posed(link)]) : [];
   }
 
   /** Draws the robot faintly while its state is outdated. */

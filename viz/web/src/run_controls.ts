@@ -31,7 +31,9 @@ export class RunControls {
     element("controls").hidden = !canControl || !(isRunning || canSaveEdits);
     element("save-edits").hidden = !canControl || !canSaveEdits;
     element("pause").hidden = !isRunning;
-    element("save").textContent = isRunning ? "Save checkpoint" : "Save edits";
-    element("save").title = isRunning ? "Write a checkpoint now" : "Save the edits in the folder of the model";
+    const save = element("save", HTMLButtonElement);
+    save.textContent = isRunning ? "Save checkpoint" : "Save edits";
+    save.dataset.title = isRunning ? "Write a checkpoint now" : "Save the edits in the folder of the model";
+    if (!save.disabled) save.title = save.dataset.title; // Otherwise, the title says why.
   }
 }
