@@ -508,8 +508,8 @@ fn page_shows_connection_loss_and_run_result() {
     let camera = Camera::start(hub.clone());
     wait_for(&mut browser, "a full picture", |browser| browser.text("picture-text").contains("100 %"));
     wait_for(&mut browser, "a live image", |browser| label(browser) == "live");
-    wait_for(&mut browser, "the end of delays", |browser| browser.text("banner").is_empty());
     browser.evaluate(RECORDER);
+    assert_eq!(browser.text("banner"), "");
     save_screenshot(&mut browser, "connected");
     let bounds = canvas_bounds(&mut browser);
 
@@ -527,13 +527,12 @@ fn page_shows_connection_loss_and_run_result() {
     browser.evaluate("record.isLive = false");
     proxy.restore();
     wait_for(&mut browser, "the return", |browser| browser.text("connection").contains("connected"));
-    let returned_at = Instant::now();
-    wait_for(&mut browser, "the end of the outage", |browser| browser.text("banner").is_empty());
-    assert!(returned_at.elapsed() < Duration::from_secs(5), "the banner stayed for {:?}", returned_at.elapsed());
+    std::thread::sleep(Duration::from_millis(1500));
+    assert_eq!(browser.text("banner"), "");
     let shown_after = browser.evaluate("record.shownAfter").as_f64().expect("the loss was shown");
     assert!(shown_after < MAX_LOSS_DISPLAY_MILLIS, "the lost connection was shown after {shown_after} ms");
     assert_eq!(browser.evaluate("record.isLive"), false, "an image from before the cut was labeled live");
-    wait_for(&mut browser, "the age of the last image", |browser| label(browser).contains("old"));
+    assert!(label(&mut browser).contains("old"), "{}", label(&mut browser));
     let camera = Camera::start(hub.clone());
     wait_for(&mut browser, "a live image", |browser| label(browser) == "live");
     camera.stop();

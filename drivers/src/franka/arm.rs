@@ -263,8 +263,8 @@ impl StateReader {
                     return Ok(());
                 }
                 received = network.udp.try_receive(&mut buffer).unwrap_or(None);
-                // The next state may have been sent after the previous one was read. With an earlier time it would seem
-                // to have arrived before it was sent, which would shift the stamps of all later states.
+                // Every state gets its own arrival time. With that of an earlier state, it could seem to have arrived
+                // before it was sent, which would shift the stamps of all later states.
                 at = clock::now();
             }
             if let Some((from, numbered, stamp)) = newest {

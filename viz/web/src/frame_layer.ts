@@ -44,15 +44,18 @@ export class FrameLayer {
 
   /** Draws these frames by name, and removes all others. Names are placed for this camera. */
   update(posed: Map<string, PosedFrame>, camera: THREE.PerspectiveCamera): void {
+    // Read before styles change; otherwise, the browser would compute the layout twice.
+    const { clientWidth, clientHeight } = this.names;
+    const scale = new THREE.Vector3().setScalar(this.axisLengthM);
     for (const [name, frame] of this.frames) if (!posed.has(name)) this.remove(name, frame);
     for (const [name, { worldFromFrame, isOutdated }] of posed) {
       const frame = this.frames.get(name) ?? this.add(name);
-      frame.axes.matrix.copy(worldFromFrame).scale(new THREE.Vector3().setScalar(this.axisLengthM));
+      frame.axes.matrix.copy(worldFromFrame).scale(scale);
       const opacity = isOutdated ? OUTDATED_OPACITY : 1;
       (frame.axes.material as THREE.LineBasicMaterial).opacity = opacity;
       frame.name.style.opacity = String(opacity);
     }
-    this.placeNames(camera);
+    this.placeNames(camera, clientWidth, clientHeight);
   }
 
   private add(name: string): Frame {
@@ -79,16 +82,15 @@ export class FrameLayer {
     this.frames.delete(name);
   }
 
-  /** Places the visible names, in whole pixels. */
-  private placeNames(camera: THREE.PerspectiveCamera): void {
-    const { clientWidth, clientHeight } = this.names;
+  /** Places the visible names in a view of this size, in whole pixels. */
+  private placeNames(camera: THREE.PerspectiveCamera, width: number, height: number): void {
     const visible: { name: HTMLElement; at: Pixel }[] = [];
     for (const { axes, name } of this.frames.values()) {
       const { x, y, z } = new THREE.Vector3().setFromMatrixPosition(axes.matrix).project(camera);
       // Points behind the viewer or outside of the view.
       name.hidden = !(Math.abs(x) <= 1 && Math.abs(y) <= 1 && Math.abs(z) <= 1);
       if (name.hidden) continue;
-      visible.push({ name, at: [Math.round(0.5 * clientWidth * (1 + x)), Math.round(0.5 * clientHeight * (1 - y))] });
+      visible.push({ name, at: [Math.round(0.5 * width * (1 + x)), Math.round(0.5 * height * (1 - y))] });
     }
     const placed = withoutOverlaps(visible.map(({ at }) => at));
     visible.forEach(({ name }, ix) => {

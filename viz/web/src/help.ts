@@ -38,10 +38,10 @@ export function showKeysInTitles(isShown: boolean): void {
   for (const button of buttons()) {
     const title = fullTitle(button);
     const [, before, key, after] = KEY_IN_TITLE.exec(title) ?? [];
-    const isFlyKey = key !== undefined && FLY_KEYS.some(([keys]) => keys.split(" ").includes(key));
-    if (!isFlyKey || (button.title !== title && button.title !== before! + after!)) continue; // A reason is shown.
+    if (key === undefined || button.disabled) continue; // The title of a disabled button says why it is disabled.
+    const isFlyKey = FLY_KEYS.some(([keys]) => keys.split(" ").includes(key));
     button.dataset.title = title;
-    button.title = isShown ? title : before! + after!;
+    button.title = isShown || !isFlyKey ? title : before! + after!;
   }
 }
 

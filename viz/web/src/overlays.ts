@@ -18,13 +18,19 @@ export interface PosedFrame {
   isOutdated: boolean;
 }
 
+interface LiveCamera {
+  lines: THREE.LineSegments;
+  worldFromCamera: THREE.Matrix4;
+  /** Changes whenever other lines must be drawn. */
+  key: string;
+}
+
 export class Overlays {
   readonly root = new THREE.Group();
   private readonly ground = new THREE.Group();
   private readonly cameras = new THREE.Group();
   private readonly keyframes: THREE.LineSegments;
-  private readonly live = new Map<string, THREE.LineSegments>();
-  private readonly livePoses = new Map<string, THREE.Matrix4>();
+  private readonly live = new Map<string, LiveCamera>();
   private isLive = true;
   private frustumDepth = 0.06;
   private posed: (PosedCamera | NumberedKeyframe)[] = [];
@@ -94,41 +100,36 @@ export class Overlays {
   /** Sets whether the poses of the live cameras are current; if not, they are drawn faintly. */
   setLive(isLive: boolean): void {
     this.isLive = isLive;
-    for (const drawn of this.live.values()) {
-      (drawn.material as THREE.LineBasicMaterial).opacity = isLive ? 1 : 0.3;
+    for (const { lines } of this.live.values()) {
+      (lines.material as THREE.LineBasicMaterial).opacity = isLive ? 1 : 0.3;
     }
   }
 
   /** Removes the live cameras: a new server may have others. */
   forgetLive(): void {
-    for (const drawn of this.live.values()) {
-      drawn.geometry.dispose();
-      (drawn.material as THREE.LineBasicMaterial).dispose();
-      drawn.removeFromParent();
+    for (const { lines } of this.live.values()) {
+      lines.geometry.dispose();
+      (lines.material as THREE.LineBasicMaterial).dispose();
+      lines.removeFromParent();
     }
     this.live.clear();
-    this.livePoses.clear();
   }
 
   /** Poses of the live cameras in the world. */
   cameraPoses(): [string, PosedFrame][] {
     const isOutdated = !this.isLive;
-    return [...this.livePoses].map(([name, worldFromFrame]) => [name, { worldFromFrame, isOutdated }]);
+    return [...this.live].map(([name, { worldFromCamera }]) => [name, { worldFromFrame: worldFromCamera, isOutdated }]);
   }
 
   /** Draws a camera at its current pose; returns whether the pose changed. */
   setLiveCamera(camera: PosedCamera): boolean {
-    let drawn = this.live.get(camera.camera);
-    const poseKey = [...camera.world_from_camera, ...camera.focal_px, this.frustumDepth].join();
-    if (drawn?.name === poseKey) return false;
-    if (!drawn) {
-      drawn = this.lines(LIVE_COLOR, 1);
-      this.live.set(camera.camera, drawn);
-      this.cameras.add(drawn);
-    }
-    drawn.name = poseKey;
-    this.livePoses.set(camera.camera, worldFromCamera(camera.world_from_camera));
-    setLines(drawn, frustum(camera, 1.6 * this.frustumDepth));
+    const key = [...camera.world_from_camera, ...camera.focal_px, this.frustumDepth].join();
+    const before = this.live.get(camera.camera);
+    if (before?.key === key) return false;
+    const lines = before?.lines ?? this.lines(LIVE_COLOR, 1);
+    if (!before) this.cameras.add(lines);
+    this.live.set(camera.camera, { lines, worldFromCamera: worldFromCamera(camera.world_from_camera), key });
+    setLines(lines, frustum(camera, 1.6 * this.frustumDepth));
     return true;
   }
 
