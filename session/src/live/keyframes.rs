@@ -1,0 +1,146 @@
+//! Passes keyframes on to the models.
+
+use super::{IDLE, Live, Pace};
+use crate::ledger::KeyframeTimes;
+use crate::scene_hint;
+use crate::session::Session;
+use capture::{Change, FeedItem};
+use std::time::{Duration, Instant};
+
+/// Minimum number of keyframes that determine the first view of the scene.
+const HINT_KEYFRAMES: usize = 5;
+/// Polling period while waiting for a keyframe or a picture request.
+const POLL_PERIOD: Duration = Duration::from_millis(2);
+
+impl Live {
+    /// Pushes new keyframes to the models: all waiting keyframes in real time, or the keyframe that is due in lockstep.
+    /// Does nothing during an evaluation.
+    pub(super) fn take_keyframes(&mut self) -> crate::Result<()> {
+        if self.is_scoring() {
+            return Ok(());
+        }
+        if self.requests.is_paused && self.pace != Pace::RealTime {
+            self.hub.wait_for_request(IDLE); // The next keyframe is due at a later step.
+            return Ok(());
+        }
+        self.apply_alignments()?;
+        if let Some(first_image) = self.feed.first_image() {
+            self.sessions.iter_mut().for_each(|session| session.start_clock(first_image));
+        }
+        let n_before = self.keyframes.len();
+        match self.pace {
+            Pace::RealTime => {
+                if !self.is_training() || self.is_idle() || self.requests.is_paused {
+                    let first = self.wait_for_change();
+                    first.map_or(Ok(()), |item| self.apply(item))?;
+                }
+                while let Some(item) = self.feed.next(Duration::ZERO) {
+                    self.apply(item)?;
+                }
+            }
+            Pace::Lockstep { steps_per_keyframe } => {
+                while !self.feed.ended() && self.is_keyframe_due() {
+                    let Some(item) = self.wait_for_change() else { break };
+                    let is_new = matches!(item.change, Change::Accepted(_));
+                    self.apply(item)?;
+                    if is_new && self.is_training() {
+                        for (at, session) in self.next_keyframe_at.iter_mut().zip(&self.sessions) {
+                            *at = session.progress().step + steps_per_keyframe;
+                        }
+                    }
+                }
+            }
+        }
+        if self.keyframes.len() != n_before {
+            self.publish_keyframes();
+            if self.keyframes.len() <= self.start_keyframes.max(HINT_KEYFRAMES)
+                && let Some(hint) = scene_hint::from_keyframes(&self.keyframes)
+            {
+                self.hub.set_scene_hint(hint);
+            }
+        }
+        Ok(())
+    }
+
+    /// Applies the results of alignments that are ready.
+    fn apply_alignments(&mut self) -> crate::Result<()> {
+        let mut is_applied = false;
+        for session in &mut self.sessions {
+            is_applied |= session.poll_alignment(false)?;
+        }
+        if is_applied {
+            self.publish_keyframes();
+        }
+        Ok(())
+    }
+
+    /// Waits for the next added or removed keyframe. Returns `None` if a requested picture may be drawn now, or after
+    /// [`IDLE`].
+    fn wait_for_change(&mut self) -> Option<FeedItem> {
+        if self.hub.n_clients() == 0 {
+            return self.feed.next(IDLE);
+        }
+        let started = Instant::now();
+        loop {
+            let before = Instant::now();
+            let timeout = if self.budget.may_render() { Duration::ZERO } else { POLL_PERIOD };
+            if let Some(item) = self.feed.next(timeout) {
+                return Some(item);
+            }
+            let is_requested = self.budget.may_render() && self.hub.wait_for_request(POLL_PERIOD);
+            self.budget.add_training(before.elapsed()); // Training was idle, so drawing does not delay it.
+            if started.elapsed() >= IDLE || is_requested {
+                return None;
+            }
+        }
+    }
+
+    /// Whether each model has reached the step at which the next keyframe is due, or cannot train further without it.
+    fn is_keyframe_due(&self) -> bool {
+        let is_due = |(session, at): (&Session, &u64)| {
+            session.progress().step >= *at || session.is_idle() || session.has_finished_steps()
+        };
+        self.sessions.iter().zip(&self.next_keyframe_at).all(is_due)
+    }
+
+    fn apply(&mut self, FeedItem { change, times }: FeedItem) -> crate::Result<()> {
+        match change {
+            Change::Accepted(keyframe) => {
+                let keyframe = match &mut self.keyframe_change {
+                    Some(change) => change(keyframe),
+                    None => keyframe,
+                };
+                let pushed_at_steps = self.sessions.iter().map(|session| session.progress().step).collect();
+                self.keyframes.push(keyframe.clone());
+                let mut pushed = Ok(());
+                // A model that has made all its steps gets no more keyframes, so that it equals a model trained alone.
+                for session in self.sessions.iter_mut().filter(|session| !session.has_finished_steps()) {
+                    // Continues after a GPU failure, so that every session holds the keyframe for its restored model.
+                    pushed = pushed.and(session.push(&keyframe));
+                }
+                if let Some(input) = times {
+                    self.ledger.push(KeyframeTimes {
+                        camera: keyframe.camera.clone(),
+                        stamp: keyframe.stamp,
+                        input,
+                        pushed: Instant::now(),
+                        pushed_at_steps,
+                        trained: None,
+                        sent: None,
+                        shown: None,
+                    });
+                }
+                pushed
+            }
+            Change::Evicted { camera, stamp } => {
+                self.n_evicted += 1;
+                self.keyframes.retain(|keyframe| keyframe.camera != camera || keyframe.stamp != stamp);
+                let mut removed = Ok(());
+                for session in self.sessions.iter_mut().filter(|session| !session.has_finished_steps()) {
+                    removed = removed.and(session.remove(&camera, stamp));
+                }
+                removed
+            }
+        }
+    }
+}

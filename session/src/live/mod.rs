@@ -1,0 +1,297 @@
+//! The loop of a live run: takes keyframes, trains models, and draws pictures for viewers.
+
+mod keyframes;
+mod pictures;
+mod publishing;
+mod requests;
+
+use crate::ledger::Ledger;
+use crate::recoveries::{self, OpenGpu, Recoveries};
+use crate::render_budget::RenderBudget;
+use crate::session::Session;
+use crate::{methods, scene_hint, time_slices};
+use capture::{Feed, InputResult, Notes};
+use keyframe::{Keyframe, Split};
+use publishing::Publishing;
+use requests::Requests;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+use trainer::AlignTiming;
+use viz::Hub;
+
+/// Maximum wait for a keyframe when there is nothing to do.
+const IDLE: Duration = Duration::from_millis(10);
+
+/// When the models receive keyframes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Pace {
+    /// In real time: as soon as a keyframe arrives.
+    RealTime,
+    /// In lockstep with training: one keyframe per fixed number of steps, so that a seed determines the result.
+    Lockstep {
+        /// Steps between two keyframes.
+        steps_per_keyframe: u64,
+    },
+}
+
+impl Pace {
+    /// When the cameras are aligned.
+    pub fn align_timing(self) -> AlignTiming {
+        match self {
+            Self::RealTime => AlignTiming::RealTime,
+            Self::Lockstep { .. } => AlignTiming::Lockstep,
+        }
+    }
+}
+
+/// A live run.
+pub struct Live {
+    /// The first model is drawn for requests that name no method.
+    sessions: Vec<Session>,
+    feed: Feed,
+    hub: Hub,
+    pace: Pace,
+    start_keyframes: usize,
+    keyframes: Vec<Arc<Keyframe>>,
+    n_evicted: u64,
+    /// Step of each session at which the next keyframe is due in lockstep.
+    next_keyframe_at: Vec<u64>,
+    budget: RenderBudget,
+    recoveries: Recoveries,
+    /// Times of the keyframes.
+    ledger: Ledger,
+    keyframe_change: Option<KeyframeChange>,
+    requests: Requests,
+    publishing: Publishing,
+}
+
+/// Changes a keyframe before the models receive it.
+pub type KeyframeChange = Box<dyn FnMut(Arc<Keyframe>) -> Arc<Keyframe>>;
+
+impl Live {
+    /// Combines the parts. Training starts with the first call of [`Self::advance`].
+    pub fn new(sessions: Vec<Session>, feed: Feed, hub: Hub, options: LiveOptions) -> Self {
+        let is_software = sessions.first().is_some_and(Session::is_software);
+        Self {
+            next_keyframe_at: vec![0; sessions.len()],
+            sessions,
+            feed,
+            publishing: Publishing::new(&hub, options.notes, options.device_notes),
+            hub,
+            pace: options.pace,
+            start_keyframes: options.start_keyframes,
+            keyframes: Vec::new(),
+            n_evicted: 0,
+            budget: RenderBudget::new(is_software),
+            recoveries: Recoveries::new(options.open_gpu),
+            ledger: Ledger::default(),
+            keyframe_change: None,
+            requests: Requests::default(),
+        }
+    }
+
+    /// Continues with the keyframes of an earlier run, which the sessions already hold.
+    pub fn resume_from(mut self, keyframes: Vec<Arc<Keyframe>>) -> Self {
+        self.keyframes = keyframes;
+        self.publish_keyframes();
+        if let Some(hint) = scene_hint::from_keyframes(&self.keyframes) {
+            self.hub.set_scene_hint(hint);
+        }
+        self
+    }
+
+    /// Changes all following keyframes before the models receive them, for benchmarks with disturbed data.
+    pub fn change_keyframes(&mut self, change: KeyframeChange) {
+        self.keyframe_change = Some(change);
+    }
+
+    /// Whether the run is over: a limit was reached or cannot be reached, the devices failed, or the input ended
+    /// without training data.
+    pub fn is_over(&self) -> bool {
+        if self.is_scoring() {
+            return false; // An evaluation in progress is completed first.
+        }
+        // After one session has reached its limit, the run waits for all other sessions that can still reach theirs.
+        let is_done = |session: &Session| session.is_over() || (self.feed.ended() && session.is_idle());
+        let reached = self.sessions.iter().any(Session::is_over) && self.sessions.iter().all(is_done);
+        reached || self.has_exhausted_input() || self.feed.source_failed() || (self.feed.ended() && !self.can_train())
+    }
+
+    /// Whether the input ended and a model cannot reach its step limit without more keyframes. Without a step limit,
+    /// the run does not end, so that the result stays visible.
+    pub fn has_exhausted_input(&self) -> bool {
+        self.is_finished() && self.sessions.iter().any(|session| session.n_steps_remaining().is_some_and(|n| n > 0))
+    }
+
+    /// The hub that clients are connected to.
+    pub fn hub(&self) -> Hub {
+        self.hub.clone()
+    }
+
+    /// Keyframes in the store, in order of acceptance.
+    pub fn keyframes(&self) -> &[Arc<Keyframe>] {
+        &self.keyframes
+    }
+
+    /// Number of keyframes evicted so far.
+    pub fn n_evicted(&self) -> u64 {
+        self.n_evicted
+    }
+
+    /// Times at which each keyframe passed the stages from the camera to the screens of viewers.
+    pub fn ledger(&self) -> &Ledger {
+        &self.ledger
+    }
+
+    /// The models in training.
+    pub fn sessions(&self) -> &[Session] {
+        &self.sessions
+    }
+
+    /// Runs one cycle: takes keyframes, trains, draws and publishes. Reopens the GPU if it fails.
+    pub fn advance(&mut self) -> crate::Result<()> {
+        self.apply_controls();
+        self.record_shown_pictures();
+        self.apply_edits();
+        let advanced = self
+            .take_keyframes()
+            .and_then(|()| self.step())
+            .and_then(|()| self.render())
+            .map(|()| self.publish_chunks())
+            .map(|()| self.publish_observations())
+            .and_then(|()| self.publish());
+        advanced.or_else(|error| self.recoveries.recover(&mut self.sessions, error))
+    }
+
+    /// Waits for queued work. Reopens the GPU if it failed, and returns whether it did.
+    pub fn wait(&mut self) -> crate::Result<bool> {
+        match self.sessions.iter().try_for_each(Session::wait) {
+            Ok(()) => Ok(false),
+            Err(error) => self.recoveries.recover(&mut self.sessions, error).map(|()| true),
+        }
+    }
+
+    /// Describes how to continue if the run fails now.
+    pub fn describe_recoverable(&mut self) -> String {
+        recoveries::describe_recoverable(&mut self.sessions)
+    }
+
+    /// Trains for one slice once there are enough keyframes. During an evaluation, scores one test image instead. Does
+    /// not train if a requested picture may be drawn now.
+    fn step(&mut self) -> crate::Result<()> {
+        self.sessions.iter().try_for_each(Session::check_gpu)?;
+        if !self.is_training() {
+            return Ok(());
+        }
+        if let Some(session) = self.sessions.iter_mut().find(|session| session.is_scoring()) {
+            let before = Instant::now();
+            session.score_next()?;
+            self.budget.add_training(before.elapsed());
+            return Ok(());
+        }
+        if self.requests.is_paused {
+            // Keyframes are still accepted, and checkpoints can be requested.
+            self.sessions.iter_mut().try_for_each(Session::write_checkpoint_when_due)?;
+        }
+        if self.is_finished() || self.requests.is_paused {
+            self.hub.wait_for_request(IDLE);
+            return Ok(());
+        }
+        if self.is_render_pending() {
+            return Ok(());
+        }
+        let is_watched = self.hub.n_clients() > 0;
+        self.sessions.iter_mut().for_each(|session| session.set_watched(is_watched));
+        let is_paced = self.pace != Pace::RealTime && !self.feed.ended();
+        let due = &self.next_keyframe_at;
+        let max_steps = |ix: usize, session: &Session| match is_paced {
+            true => due[ix].saturating_sub(session.progress().step),
+            false => u64::MAX,
+        };
+        if self.pace == Pace::RealTime {
+            self.sessions.iter_mut().try_for_each(Session::pause_growth_when_slow)?;
+        }
+        let before = Instant::now();
+        let step_before = self.sessions[0].progress().step;
+        let (hub, budget) = (&self.hub, self.budget);
+        time_slices::train_next(&mut self.sessions, max_steps, || {
+            budget.may_render() && hub.wait_for_request(Duration::ZERO)
+        })?;
+        self.budget.add_training(before.elapsed());
+        // Steps before this slice are complete, because at most one submit is in flight.
+        self.ledger.completed(step_before);
+        Ok(())
+    }
+
+    /// Ends the input and a search for floaters. Returns the sessions and the results of the input.
+    pub fn finish(mut self) -> (Vec<Session>, crate::Result<InputResult>) {
+        // Changes only the state; the rest of the status stays visible until the scores are published.
+        self.hub.set_state("saving");
+        if self.erase_found(true) {
+            self.publish_status();
+            self.hub.set_state("saving");
+        }
+        (self.sessions, self.feed.finish().map_err(Into::into))
+    }
+
+    /// Why there is no model of this method.
+    fn unknown_method(&self, method: Option<&str>) -> String {
+        methods::unknown(self.sessions.iter().map(Session::kind), method)
+    }
+
+    fn is_scoring(&self) -> bool {
+        self.sessions.iter().any(Session::is_scoring)
+    }
+
+    fn is_training(&self) -> bool {
+        self.can_train() && (self.keyframes.len() >= self.start_keyframes || self.feed.ended())
+    }
+
+    /// Whether there is a training keyframe. With several cameras, the first keyframe of each is a test keyframe.
+    fn can_train(&self) -> bool {
+        self.keyframes.iter().any(|keyframe| keyframe.split == Split::Train)
+    }
+
+    /// Whether no model can train before the next keyframe arrives.
+    fn is_idle(&self) -> bool {
+        self.sessions.iter().all(|session| session.is_idle() || session.has_finished_steps())
+    }
+
+    /// Whether the input ended and all training is done; the models stay visible until the user ends the run.
+    fn is_finished(&self) -> bool {
+        self.feed.ended() && self.is_idle()
+    }
+
+    fn state(&self) -> &'static str {
+        if self.is_finished() {
+            "finished"
+        } else if self.requests.is_paused {
+            "paused"
+        } else if self.is_training() {
+            "training"
+        } else if self.feed.first_image().is_some() {
+            "collecting keyframes"
+        } else {
+            "waiting for images"
+        }
+    }
+}
+
+/// Options of a live run.
+pub struct LiveOptions {
+    /// When the models receive keyframes.
+    pub pace: Pace,
+    /// Number of keyframes with which training starts.
+    pub start_keyframes: usize,
+    /// Notes shown on the page.
+    pub notes: Vec<String>,
+    /// Notes about the devices, which are added during the run and shown, too.
+    pub device_notes: Notes,
+    /// Reopens the GPU after a failure.
+    pub open_gpu: OpenGpu,
+}
+
+/// Index of the session of a method; of the first one if no method is given.
+fn session_for_method(sessions: &[Session], method: Option<&str>) -> Option<usize> {
+    sessions.iter().position(|session| method.is_none_or(|name| session.kind().name() == name))
+}

@@ -1,0 +1,186 @@
+//! Publishes keyframes, models and the status of a run to viewers.
+
+use super::Live;
+use crate::chunk_publisher::ChunkPublisher;
+use crate::observations::{ModelState, ObservationPublisher, PosedKeyframe};
+use crate::session::Session;
+use calibration::CalibratedCamera;
+use capture::Notes;
+use keyframe::Keyframe;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+use trainer::RenderRequest;
+use viz::{Hub, KeyframePose, ModelStatus, Status};
+
+/// Period of status messages.
+const PUBLISH_PERIOD: Duration = Duration::from_millis(250);
+/// Maximum fraction of the time that is spent on scoring between scheduled evaluations.
+const SCORE_FRAC: f64 = 0.03;
+
+/// What was published, and what to publish next.
+pub(super) struct Publishing {
+    /// When the status was published; `None` if it is due.
+    pub(super) status_at: Option<Instant>,
+    /// Corrected cameras of the published keyframes.
+    cameras: Vec<CalibratedCamera>,
+    /// Session whose latest score is refreshed next.
+    next_refreshed: usize,
+    scoring_time: Duration,
+    /// Notes on the run.
+    notes: Vec<String>,
+    device_notes: Notes,
+    chunks: ChunkPublisher,
+    observations: ObservationPublisher,
+}
+
+impl Publishing {
+    pub(super) fn new(hub: &Hub, notes: Vec<String>, device_notes: Notes) -> Self {
+        Self {
+            status_at: None,
+            cameras: Vec::new(),
+            next_refreshed: 0,
+            scoring_time: Duration::ZERO,
+            notes,
+            device_notes,
+            chunks: ChunkPublisher::new(hub.clone()),
+            observations: ObservationPublisher::new(hub.clone()),
+        }
+    }
+}
+
+impl Live {
+    /// Publishes the keyframes and the corrections of live images, as estimated by the first model.
+    pub(super) fn publish_keyframes(&mut self) {
+        let cameras: Vec<_> = self.keyframes.iter().map(|keyframe| self.sessions[0].camera_of(keyframe)).collect();
+        let posed = || self.keyframes.iter().zip(&cameras);
+        // Live images get the correction of their camera's newest keyframe.
+        let correction = |(keyframe, camera): (&Arc<Keyframe>, &CalibratedCamera)| {
+            (keyframe.camera.clone(), keyframe.world_from_camera.inverse() * camera.world_from_camera)
+        };
+        self.hub.set_camera_corrections(posed().map(correction).collect());
+        self.hub.set_keyframe_sources(&self.keyframes);
+        self.hub.set_keyframes(posed().map(|(keyframe, camera)| frustum(keyframe, camera)).collect());
+        self.publishing.cameras = cameras;
+    }
+
+    /// Publishes the keyframes again if corrections have moved one of them noticeably.
+    fn publish_moved_keyframes(&mut self) {
+        let has_moved = |(keyframe, published): (&Arc<Keyframe>, &CalibratedCamera)| {
+            self.sessions[0].camera_of(keyframe).differs_noticeably(published)
+        };
+        if self.keyframes.iter().zip(&self.publishing.cameras).any(has_moved) {
+            self.publish_keyframes();
+        }
+    }
+
+    /// Publishes the models that clients draw themselves. Pictures and chunks share one budget.
+    pub(super) fn publish_chunks(&mut self) {
+        if !self.is_scoring() && self.budget.may_render() {
+            for session in &mut self.sessions {
+                self.budget.add_render(session.publish_chunks(&mut self.publishing.chunks));
+            }
+        }
+    }
+
+    /// Publishes when and how precisely each part of the scene was observed. Depth of cameras without depth is rendered with
+    /// the first model.
+    pub(super) fn publish_observations(&mut self) {
+        let can_render = self.is_training() && !self.is_scoring() && self.budget.may_render();
+        if !can_render || !self.publishing.observations.is_due() {
+            return;
+        }
+        let session = &mut self.sessions[0];
+        let posed = |keyframe: &Arc<Keyframe>| {
+            let camera = session.camera_of(keyframe);
+            PosedKeyframe {
+                pose: frustum(keyframe, &camera),
+                keyframe: Some(Arc::clone(keyframe)),
+                color_from_depth: camera.color_from_depth.unwrap_or_default(),
+            }
+        };
+        let keyframes: Vec<PosedKeyframe> = self.keyframes.iter().map(posed).collect();
+        let captured_at = |pose: &KeyframePose| {
+            let mut newest_first = self.ledger.keyframes().iter().rev();
+            let times = newest_first.find(|times| times.camera == pose.camera && times.stamp == pose.stamp)?;
+            Some(times.captured_at())
+        };
+        let edits = Arc::clone(session.edits());
+        let model = ModelState { step: session.progress().step, edits: &edits, captured_at: &captured_at };
+        let render = |request: &RenderRequest| session.render(request);
+        let spent = self.publishing.observations.publish(&keyframes, &model, render);
+        self.budget.add_render(spent);
+    }
+
+    /// Publishes the status of the run to viewers, a few times per second.
+    pub(super) fn publish(&mut self) -> crate::Result<()> {
+        if self.publishing.status_at.is_some_and(|published| published.elapsed() < PUBLISH_PERIOD) {
+            return Ok(());
+        }
+        self.publishing.status_at = Some(Instant::now());
+        let clock_secs = self.sessions[0].secs();
+        if self.publishing.scoring_time.as_secs_f64() < SCORE_FRAC * clock_secs && !self.is_scoring() {
+            let before = Instant::now();
+            // Scores only one image at a time, so that viewers do not wait.
+            self.publishing.next_refreshed = (self.publishing.next_refreshed + 1) % self.sessions.len();
+            let session = &mut self.sessions[self.publishing.next_refreshed];
+            if session.progress().step > 0 {
+                session.n_total_steps()?;
+                session.refresh_psnr()?;
+                // No work is queued here, so reading the corrections does not delay training.
+                session.refresh_corrections()?;
+            }
+            self.publishing.scoring_time += before.elapsed();
+            self.budget.add_training(before.elapsed());
+            self.publish_moved_keyframes();
+        }
+        self.publish_status();
+        Ok(())
+    }
+
+    pub(super) fn publish_status(&self) {
+        let movements = self.sessions[0].alignment().map_or(&[][..], |alignment| &alignment.movements[..]);
+        let mut models = self.sessions.iter().map(model_status);
+        self.hub.set_status(Status {
+            state: self.state().to_owned(),
+            seconds: self.sessions[0].secs(),
+            keyframes: self.keyframes.len() as u64,
+            rejected: self.feed.rejected(),
+            model: models.next().unwrap_or_default(),
+            others: models.collect(),
+            edit_revision: self.requests.edit_revision,
+            notes: (self.publishing.notes.iter().cloned())
+                .chain(self.publishing.device_notes.list())
+                .chain(movements.iter().map(ToString::to_string))
+                .chain(self.requests.notes())
+                .collect(),
+            ..Status::default()
+        });
+    }
+}
+
+fn model_status(session: &Session) -> ModelStatus {
+    let progress = session.progress();
+    ModelStatus {
+        method: session.kind().name().to_owned(),
+        step: progress.step,
+        step_millis: (progress.step > 0).then_some(progress.step_millis),
+        primitives: progress.primitives,
+        primitives_label: session.kind().entry().primitives_label.to_owned(),
+        bytes: progress.bytes,
+        has_chunks: session.kind().entry().has_chunks,
+        edits: session.edits().len(),
+        psnr: session.psnr(),
+        psnr_history: session.psnr_history().to_vec(),
+    }
+}
+
+fn frustum(keyframe: &Keyframe, camera: &CalibratedCamera) -> KeyframePose {
+    KeyframePose {
+        camera: keyframe.camera.clone(),
+        stamp: keyframe.stamp,
+        world_from_camera: camera.world_from_camera,
+        size_px: keyframe.size_px,
+        focal_px: camera.focal_px,
+        principal_px: camera.principal_px,
+    }
+}
