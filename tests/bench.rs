@@ -177,13 +177,19 @@ fn curve_bench_skips_methods_without_sufficient_data() {
             assert!(line["summary"][known].as_f64() > Some(0.0), "{known}: {line}");
         }
     }
-    // A distance field is finished when every training image is fused, regardless of the time limit.
-    let tsdf = &lines[1]["runs"][0];
-    assert_eq!(tsdf["end"]["step"], tsdf["settings"]["n_train"], "{tsdf}");
     assert_chart(&folder.join("c"), "curve");
     assert_chart(&folder.join("c"), "curve-size");
     let page = std::fs::read_to_string(folder.join("c/curve.html")).expect("a page");
     assert!(page.contains("deep, nerf") && page.contains("flat has no depth"), "{page}");
+
+    // A distance field is finished once every training image is fused, long before this time limit.
+    let printed = events(
+        folder,
+        &["curve", "deep", "--method", "tsdf", "--seconds", "60", "--seeds", "1", "--out", "e", "--json"],
+    );
+    let tsdf = &printed.last().expect("events")["findings"]["lines"][0]["runs"][0];
+    assert_eq!(tsdf["end"]["step"], tsdf["settings"]["n_train"], "{tsdf}");
+    assert!(tsdf["end"]["seconds"].as_f64().is_some_and(|secs| secs < 60.0), "{tsdf}");
 
     assert_fails_with(folder, &["curve", "flat", "--method", "tsdf", "--seconds", "1", "--out", "d"], 4, &["depth"]);
     assert_fails_with(folder, &["budget", "flat", "--method", "splat,nerf"], 2, &["splat and nerf"]);

@@ -1,7 +1,7 @@
 #!/bin/sh
 # Builds a kernel for the tests, once. Prints its path as the only line on stdout.
-#   um    User-Mode Linux, which runs as an ordinary process, with cameras and virtual CAN buses: about 3 minutes on two cores
-#   x86   kernel for QEMU, with the driver of real CAN cards: about 3 minutes
+#   um    User-Mode Linux, which runs as an ordinary process, with cameras and virtual CAN buses: about 3.5 minutes on two cores
+#   x86   kernel for QEMU, with the driver of real CAN cards: about 3.5 minutes
 #
 # usage: build-kernel.sh um|x86 FOLDER      FOLDER caches the kernel; remove it to rebuild
 #

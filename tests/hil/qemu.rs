@@ -16,7 +16,8 @@ pub(crate) const PROGRAM: &str = "/usr/bin/qemu-system-x86_64";
 /// The `ip` of busybox does not support bit rates.
 pub(crate) const IP: &str = "/usr/sbin/ip";
 
-/// First process of the kernel.
+/// First process of the kernel. Without ACPI, the kernel cannot switch the machine off, but QEMU also ends when it is
+/// restarted.
 const INIT: &str = r#"#!/bin/busybox sh
 bb=/bin/busybox
 $bb mount -t proc proc /proc
@@ -27,7 +28,7 @@ $bb stty -echo
 export LD_LIBRARY_PATH=/lib PATH=/bin
 /bin/hil --ignored --test-threads=1 --nocapture kvaser::
 echo "hil: exit $?"
-$bb poweroff -f
+$bb reboot -f
 "#;
 
 /// Stands in for `sudo`, which the printed commands use; all processes here run as root. The explicit path bypasses the
