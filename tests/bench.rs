@@ -182,7 +182,7 @@ fn curve_bench_skips_methods_without_sufficient_data() {
     let page = std::fs::read_to_string(folder.join("c/curve.html")).expect("a page");
     assert!(page.contains("deep, nerf") && page.contains("flat has no depth"), "{page}");
 
-    // A distance field is finished once every training image is fused, long before this time limit.
+    // Training of a distance field ends once every image is fused, before the time limit.
     let printed = events(
         folder,
         &["curve", "deep", "--method", "tsdf", "--seconds", "60", "--seeds", "1", "--out", "e", "--json"],

@@ -16,8 +16,8 @@ pub(crate) const PROGRAM: &str = "/usr/bin/qemu-system-x86_64";
 /// The `ip` of busybox does not support bit rates.
 pub(crate) const IP: &str = "/usr/sbin/ip";
 
-/// First process of the kernel. Without ACPI, the kernel cannot switch the machine off, but QEMU also ends when it is
-/// restarted.
+/// First process of the kernel. It ends QEMU by a restart (`-no-reboot`), because a kernel without ACPI cannot switch the
+/// machine off.
 const INIT: &str = r#"#!/bin/busybox sh
 bb=/bin/busybox
 $bb mount -t proc proc /proc

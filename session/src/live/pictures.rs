@@ -30,10 +30,7 @@ impl Live {
         if !self.is_training() || self.is_idle() || self.requests.is_paused {
             self.budget.refill(); // Training is idle, so drawing does not delay it.
         }
-        while started.elapsed() < MAX_RENDER_TIME
-            && self.budget.may_render()
-            && self.hub.wait_for_request(Duration::ZERO)
-        {
+        while started.elapsed() < MAX_RENDER_TIME && self.is_render_pending() {
             // Work queued before the pictures counts as training time.
             let before = Instant::now();
             for session in &mut self.sessions {

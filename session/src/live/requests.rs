@@ -1,10 +1,10 @@
-//! Applies what operators request: pausing, checkpoints, edits.
+//! Applies the requests of operators: pausing, checkpoints, edits.
 
 use super::{Live, session_for_method};
 use crate::editing::Editor;
 use viz::{Control, EditRequest};
 
-/// The state of operators' requests.
+/// Requests of operators, and their results.
 #[derive(Default)]
 pub(super) struct Requests {
     /// Whether an operator has paused training.
@@ -12,14 +12,14 @@ pub(super) struct Requests {
     /// Result of the last checkpoint that an operator requested.
     checkpoint_note: Option<String>,
     editor: Editor,
-    /// What the last edit did.
+    /// Result of the last edit.
     edit_note: Option<String>,
     /// Number of times that edits of any model have changed.
     pub(super) edit_revision: u64,
 }
 
 impl Requests {
-    /// What viewers are told about the requests.
+    /// Notes on checkpoints and edits, for viewers.
     pub(super) fn notes(&self) -> impl Iterator<Item = String> {
         [self.checkpoint_note.clone(), self.edit_note.clone(), self.editor.note()].into_iter().flatten()
     }
