@@ -16,21 +16,30 @@ pub(super) const FREE_PORT: &str = "127.0.0.1:0";
 /// Timeout of the tests. It is long because a busy machine may be slow; a successful test does not wait this long.
 pub(super) const TEST_TIMEOUT: Duration = Duration::from_secs(20);
 pub(super) const REST_RAD: [f64; N_JOINTS] = [0.1, -0.5, 0.2, -2.0, 0.3, 1.8, 0.7];
+/// How long a robot waits for franka-rs, which does not correct a motion after a missed answer.
+const CLIENT_WAIT: Duration = Duration::from_millis(200);
 pub(super) const VERSIONS: [FciVersion; 2] = [FciVersion::V5, FciVersion::V10];
 
 pub(super) fn chain(tip: &str) -> Chain {
     Chain::from_urdf(URDF, "link0", tip).unwrap()
 }
 
+/// A robot that waits for its answers no longer than a real one.
 pub(super) fn robot(version: FciVersion, joint_simulator: JointSimulator) -> EmulatedRobot {
+    waiting_robot(version, Duration::ZERO, joint_simulator)
+}
+
+/// A robot whose motions wait for each answer.
+pub(super) fn waiting_robot(
+    version: FciVersion,
+    answer_wait: Duration,
+    joint_simulator: JointSimulator,
+) -> EmulatedRobot {
     let limits = if version == FciVersion::V5 { Limits::panda() } else { Limits::fr3() };
     let flange_from_tool = Transform::new([0.0, 0.0, 0.1034].into(), [0.0, 0.0, -std::f64::consts::FRAC_PI_4].into());
     let address = FREE_PORT.parse().unwrap();
-    EmulatedRobot::start(
-        RobotConfig { address, version, chain: chain("link8"), flange_from_tool, limits },
-        joint_simulator,
-    )
-    .unwrap()
+    let config = RobotConfig { address, version, chain: chain("link8"), flange_from_tool, limits };
+    EmulatedRobot::start_waiting(config, answer_wait, joint_simulator).unwrap()
 }
 
 pub(super) fn config(address: SocketAddr) -> ArmConfig {
@@ -169,27 +178,7 @@ fn quintic(frac: f64, by_rad: f64) -> f64 {
 }
 
 /// Moves the fourth joint with franka-rs, which implements libfranka's loop, without its limits and filters.
-///
-/// If the machine is so busy that the client is not woken for 20 ms, the robot correctly triggers a reflex. The motion
-/// is then retried.
 fn move_to(client: &Robot, goal_rad: f64, secs: f64) -> Result<(), FrankaError> {
-    const MAX_ATTEMPTS: usize = 5;
-    let mut result = Ok(());
-    for _ in 0..MAX_ATTEMPTS {
-        result = move_once(client, goal_rad, secs);
-        match &result {
-            Err(FrankaError::Control(stopped))
-                if stopped.last_motion_errors.get("communication_constraints_violation") =>
-            {
-                recover(client);
-            }
-            _ => return result,
-        }
-    }
-    result
-}
-
-fn move_once(client: &Robot, goal_rad: f64, secs: f64) -> Result<(), FrankaError> {
     let mut start = None;
     let mut time = 0.0;
     client.control_joint_positions(
@@ -225,7 +214,7 @@ fn recover(client: &Robot) {
 #[test]
 fn motion_beyond_limits_triggers_reflex_until_recovery() {
     for version in VERSIONS {
-        let emulated = robot(version, ideal_joints());
+        let emulated = waiting_robot(version, CLIENT_WAIT, ideal_joints());
         let client = Robot::new(&emulated.address().to_string(), RealtimeConfig::Ignore).unwrap();
         assert_eq!(client.fci_version(), version);
         move_to(&client, REST_RAD[3] + 0.1, 1.0).unwrap();
@@ -261,7 +250,7 @@ fn contact_above_threshold_ends_motion() {
         joints.external_torque_nm[2] = if is_moving { *contact.lock().unwrap() } else { 0.0 };
         joints
     });
-    let emulated = robot(FciVersion::V10, joint_simulator);
+    let emulated = waiting_robot(FciVersion::V10, CLIENT_WAIT, joint_simulator);
     let client = Robot::new(&emulated.address().to_string(), RealtimeConfig::Ignore).unwrap();
     client.set_collision_behavior_simple([5.0; 7], [10.0; 7], [20.0; 6], [40.0; 6]).unwrap();
     *contact_nm.lock().unwrap() = 9.0;

@@ -5,7 +5,7 @@ pub(crate) mod fuzz;
 
 use super::super::{N_JOINTS, realtime};
 use super::message::{Command, Reply, Request};
-use super::robot::Robot;
+use super::robot::{Mode, Robot};
 use super::{CommandedJoints, JointSimulator, RobotConfig};
 use crate::{Error, clock};
 use franka::FciVersion;
@@ -38,7 +38,18 @@ pub struct EmulatedRobot {
 
 impl EmulatedRobot {
     /// Starts listening. From then on, `joint_simulator` is called for the joint states.
-    pub fn start(config: RobotConfig, mut joint_simulator: JointSimulator) -> Result<Self, Error> {
+    pub fn start(config: RobotConfig, joint_simulator: JointSimulator) -> Result<Self, Error> {
+        Self::start_waiting(config, Duration::ZERO, joint_simulator)
+    }
+
+    /// Like [`start`](Self::start), but a motion waits up to `answer_wait` for the answer to each state. On a real
+    /// robot, an answer must arrive within a millisecond. Tests wait longer, so that their motions do not depend on the
+    /// load of the machine.
+    pub(crate) fn start_waiting(
+        config: RobotConfig,
+        answer_wait: Duration,
+        mut joint_simulator: JointSimulator,
+    ) -> Result<Self, Error> {
         let device = "emulated robot".to_owned();
         let n = config.chain.n_joints();
         if n != N_JOINTS {
@@ -61,6 +72,7 @@ impl EmulatedRobot {
             states,
             robot: Robot::new(config, joints),
             joint_simulator,
+            answer_wait,
             client: None,
             stop: Arc::clone(&stop),
         };
@@ -90,6 +102,8 @@ struct Server {
     states: UdpSocket,
     robot: Robot,
     joint_simulator: JointSimulator,
+    /// Maximum time by which an answer may be late during a motion.
+    answer_wait: Duration,
     client: Option<Client>,
     stop: Arc<AtomicBool>,
 }
@@ -117,20 +131,20 @@ impl Server {
             let due = start_time + STEP * n_steps;
             let now = clock::now();
             let lag = now.duration_since(due);
-            if lag > MAX_LAG {
+            if lag > MAX_LAG && !self.waits_for_answer() {
                 let n_skipped = u32::try_from(lag.as_millis()).unwrap_or(u32::MAX);
                 (n_steps, number) = (n_steps.saturating_add(n_skipped), number + u64::from(n_skipped));
                 continue;
             }
             std::thread::sleep(due.duration_since(now));
-            // If several states are overdue, only the last one can have been answered.
-            self.step(due, number, lag < STEP);
+            self.step(due, number, lag >= STEP);
             (n_steps, number) = (n_steps.saturating_add(1), number + 1);
         }
     }
 
     /// Simulates one millisecond: handles requests, advances the motion, sends the state.
-    fn step(&mut self, due: Stamp, number: u64, could_answer: bool) {
+    fn step(&mut self, due: Stamp, number: u64, is_late: bool) {
+        let waits_for_answer = self.waits_for_answer();
         if let Some(mut client) = self.client.take() {
             match client.read_requests(&mut self.robot) {
                 Ok(()) => self.client = Some(client),
@@ -138,7 +152,10 @@ impl Server {
             }
         }
         self.accept_client();
-        let command = self.newest_command(number - 1);
+        let wait = if waits_for_answer { self.answer_wait } else { Duration::ZERO };
+        let command = self.command(number - 1, wait);
+        // If several states are overdue, only the last one can have been answered.
+        let could_answer = waits_for_answer || !is_late;
         let finished = self.robot.follow(command.as_ref(), could_answer);
         let joints = (self.joint_simulator)(due, &self.robot.commanded);
         let contact = self.robot.observe(joints);
@@ -169,20 +186,42 @@ impl Server {
         }
     }
 
-    /// The client's answer to the state with this number, if it has arrived.
-    fn newest_command(&self, number: u64) -> Option<Command> {
-        let mut answer = None;
+    /// Whether the answer to the last state may be late.
+    fn waits_for_answer(&self) -> bool {
+        !self.answer_wait.is_zero() && matches!(self.robot.mode, Mode::Move(_))
+    }
+
+    /// The client's answer to the state with this number, if it arrives within `wait`. A datagram that is not a command
+    /// ends the wait.
+    fn command(&self, number: u64, wait: Duration) -> Option<Command> {
+        const POLL: Duration = Duration::from_micros(100);
+        let deadline = clock::now() + wait;
+        let mut received = self.receive(number);
+        while received.is_none() && clock::now() < deadline && !self.stop.load(Ordering::Relaxed) {
+            std::thread::sleep(POLL);
+            received = self.receive(number);
+        }
+        received.flatten()
+    }
+
+    /// Reads the datagrams that have arrived. Returns the client's answer to the state with this number, `Some(None)` if
+    /// there is only a datagram that is not a command, and `None` if there is neither.
+    fn receive(&self, number: u64) -> Option<Option<Command>> {
+        let mut received = None;
         let mut buffer = [0; MAX_COMMAND_BYTES];
         loop {
             match self.states.recv_from(&mut buffer) {
                 Ok((n, from)) => {
                     let is_from_client = self.client.as_ref().is_some_and(|client| client.ip == from.ip());
-                    let command = Command::decode(self.robot.config.version, &buffer[..n]);
-                    answer = command.filter(|command| is_from_client && command.number == number).or(answer);
+                    match Command::decode(self.robot.config.version, &buffer[..n]) {
+                        Some(command) if is_from_client && command.number == number => received = Some(Some(command)),
+                        Some(_) => {}
+                        None => received = received.or(Some(None)),
+                    }
                 }
                 // If a client has closed its port, the error of an earlier send is reported here.
                 Err(error) if error.kind() == ErrorKind::ConnectionRefused => {}
-                Err(_) => return answer,
+                Err(_) => return received,
             }
         }
     }
