@@ -36,9 +36,10 @@ impl OnTerminal {
         unlockpt(&master).unwrap();
         let name = ptsname(&master, Vec::new()).unwrap();
         let open = || OpenOptions::new().read(true).write(true).open(OsStr::from_bytes(name.to_bytes())).unwrap();
-        let mut command = Command::new(if controlled { "setsid" } else { EXE });
+        let mut command = Command::new(if controlled { "env" } else { EXE });
         if controlled {
-            command.args(["--ctty", EXE]);
+            // SIGHUP may be ignored, for example if the tests run under `nohup`.
+            command.args(["--default-signal=HUP", "setsid", "--ctty", EXE]);
         }
         let child = command.args(args).current_dir(folder).stdin(open()).stdout(open()).stderr(open()).spawn().unwrap();
         Self { child, terminal: File::from(master), printed: Vec::new() }

@@ -302,4 +302,21 @@ mod tests {
         assert!(error.translation.vector.norm() < 1e-12 && error.rotation.angle() < 1e-7, "{error}");
         assert_eq!((depth.stamp, depth.is_measured, depth.pixel_rad), (Stamp(7), true, 1.0 / 600.0));
     }
+
+    #[test]
+    fn map_is_computed_again_after_a_noticeable_correction() {
+        let mut publisher = ObservationPublisher::new(Hub::new());
+        let edits = Arc::default();
+        let mut is_computed_at = |x_m: f64| {
+            let keyframes = [posed(Transform::translation(x_m, 0.0, 0.0), Transform::identity())];
+            let model = ModelState { step: 1000, edits: &edits, captured_at: &|_| None };
+            publisher.publish(&keyframes, &model, |request| {
+                let n = (request.size_px[0] * request.size_px[1]) as usize;
+                Ok(Picture { size_px: request.size_px, rgba_srgb: Vec::new(), depth_m: vec![1.0; n] })
+            });
+            publisher.task.take().is_some_and(|(_, thread)| thread.join().is_ok())
+        };
+        let computed = [0.0, 0.0, 1e-9, 0.01, 0.01].map(&mut is_computed_at);
+        assert_eq!(computed, [true, false, false, true, false]);
+    }
 }

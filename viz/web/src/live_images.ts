@@ -8,6 +8,8 @@ import type { ServerClock } from "./server_clock";
 const LIVE_MILLIS = 500;
 /** Older images are dimmed. */
 const DIM_MILLIS = 2000;
+/** Key under which the browser stores which cameras' images are in the side panel. */
+const DOCKED_KEY = "docked-cameras";
 
 interface Slot {
   figure: HTMLElement;
@@ -15,8 +17,6 @@ interface Slot {
   caption: HTMLElement;
   age: HTMLElement;
   dock: HTMLButtonElement;
-  /** Whether the user has moved the image to the side panel. */
-  isDocked: boolean;
   capturedMillis: number;
   waiting: { header: LiveImageHeader; jpeg: Uint8Array<ArrayBuffer> } | null;
   isDecoding: boolean;
@@ -27,6 +27,8 @@ export class LiveImages {
   readonly resized = new Map<string, boolean>();
   private isEnabled = true;
   private hasDock = true;
+  /** Cameras whose image the user has moved to the side panel. */
+  private readonly docked = storedCameras();
   private readonly slots = new Map<string, Slot>();
 
   constructor(
@@ -83,7 +85,8 @@ export class LiveImages {
   }
 
   /** Moves an image to where it belongs, and describes its button. */
-  private place({ figure, dock, isDocked }: Slot): void {
+  private place({ figure, dock }: Slot): void {
+    const isDocked = this.docked.has(figure.dataset.camera!);
     const parent = element(isDocked && this.hasDock ? "docked" : "live");
     dock.textContent = isDocked ? "⇤" : "⇥";
     dock.title = isDocked ? "Move this image to the view" : "Move this image to the side panel";
@@ -119,14 +122,15 @@ export class LiveImages {
     figure.append(canvas, caption);
     figure.dataset.camera = camera;
     figure.addEventListener("click", () => {
-      if (!slot.isDocked) this.setEnlarged(figure, !figure.classList.contains("enlarged"));
+      if (!this.docked.has(camera)) this.setEnlarged(figure, !figure.classList.contains("enlarged"));
     });
     dock.addEventListener("click", (event) => {
       event.stopPropagation(); // It is not a click on the image.
-      slot.isDocked = !slot.isDocked;
+      if (!this.docked.delete(camera)) this.docked.add(camera);
+      storeCameras(this.docked);
       this.place(slot);
     });
-    const slot: Slot = { figure, canvas, caption, age, dock, isDocked: false, capturedMillis: -Infinity, waiting: null, isDecoding: false };
+    const slot: Slot = { figure, canvas, caption, age, dock, capturedMillis: -Infinity, waiting: null, isDecoding: false };
     this.place(slot);
     this.slots.set(camera, slot);
     return slot;
@@ -139,6 +143,23 @@ export class LiveImages {
       figure.classList.toggle("dimmed", millis > DIM_MILLIS);
       age.textContent = millis > LIVE_MILLIS ? ageText(millis) : "live";
     }
+  }
+}
+
+function storedCameras(): Set<string> {
+  try {
+    const stored: unknown = JSON.parse(localStorage.getItem(DOCKED_KEY) ?? "[]");
+    return new Set(Array.isArray(stored) ? stored.filter((camera) => typeof camera === "string") : []);
+  } catch {
+    return new Set(); // The browser stores nothing for this page.
+  }
+}
+
+function storeCameras(cameras: Set<string>): void {
+  try {
+    localStorage.setItem(DOCKED_KEY, JSON.stringify([...cameras]));
+  } catch {
+    // The images are in the side panel until the page is reloaded.
   }
 }
 

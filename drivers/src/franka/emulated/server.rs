@@ -23,6 +23,9 @@ use std::time::Duration;
 const STEP: Duration = Duration::from_millis(1);
 /// Maximum lag of the thread. States with a smaller lag are sent late; states with a larger lag are skipped.
 const MAX_LAG: Duration = Duration::from_millis(100);
+/// Maximum lag during a motion. For each late state, the motion is extrapolated, which a real robot does for 20 states
+/// at most.
+const MAX_MOTION_LAG: Duration = Duration::from_millis(20);
 /// Maximum message size. Real clients stay far below it.
 const MAX_MESSAGE_BYTES: usize = 1 << 16;
 /// Maximum command size; longer datagrams are not commands.
@@ -45,7 +48,7 @@ impl EmulatedRobot {
     /// Like [`start`](Self::start), but a motion waits up to `answer_wait` for the answer to each state. On a real
     /// robot, an answer must arrive within a millisecond. Tests wait longer, so that their motions do not depend on the
     /// load of the machine.
-    pub(crate) fn start_waiting(
+    pub fn start_waiting(
         config: RobotConfig,
         answer_wait: Duration,
         mut joint_simulator: JointSimulator,
@@ -131,7 +134,8 @@ impl Server {
             let due = start_time + STEP * n_steps;
             let now = clock::now();
             let lag = now.duration_since(due);
-            if lag > MAX_LAG && !self.waits_for_answer() {
+            let max_lag = if matches!(self.robot.mode, Mode::Move(_)) { MAX_MOTION_LAG } else { MAX_LAG };
+            if lag > max_lag && !self.waits_for_answer() {
                 let n_skipped = u32::try_from(lag.as_millis()).unwrap_or(u32::MAX);
                 (n_steps, number) = (n_steps.saturating_add(n_skipped), number + u64::from(n_skipped));
                 continue;
