@@ -4,15 +4,16 @@ use drivers::{PlaybackClock, clock};
 use kinematics::Stamp;
 use std::time::{Duration, Instant};
 
-/// A live image that appears to be older than this was stamped by another clock, such as a simulator's.
+/// A live image that appears to be older than this was stamped by another clock.
 const MAX_LIVE_AGE_SECS: f64 = 60.0;
 
 /// Relates stamps to the clock of this process.
 #[derive(Clone, Debug)]
 pub enum StampClock {
-    /// Devices are read in real time, and their stamps are on this computer's clock. Older ones are from another clock,
-    /// such as a simulator's.
+    /// Devices are read in real time, and their stamps are on this computer's clock. Older ones are from another clock.
     Computer,
+    /// All devices are simulated, and their stamps are on the simulation's clock.
+    Simulation,
     /// A recording is played in real time.
     Playback(PlaybackClock),
     /// A recording is read as fast as it is used.
@@ -30,7 +31,23 @@ impl StampClock {
                 is_plausible.then(|| Instant::now().checked_sub(Duration::from_secs_f64(age_secs))).flatten()
             }
             Self::Playback(playback) => playback.instant_of(stamp),
-            Self::Unrelated => None,
+            Self::Simulation | Self::Unrelated => None,
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_recent_stamps_of_this_computer_have_a_time() {
+        let recent = clock::now();
+        let long_ago = Stamp(recent.0 - 61_000_000_000);
+        let age = StampClock::Computer.instant_of(recent).map(|at| at.elapsed());
+        assert!(age.is_some_and(|age| age < Duration::from_secs(10)), "{age:?}");
+        assert_eq!(StampClock::Computer.instant_of(long_ago), None);
+        // Soon after the computer has started, a simulation's stamps look like recent ones.
+        assert_eq!(StampClock::Simulation.instant_of(recent), None);
     }
 }

@@ -108,12 +108,22 @@ pub fn rig(mut rig: Rig, devices: Devices) -> crate::Result<Opened> {
         check_intrinsics(&rig)?;
     }
     let real = real::open(&mut rig).map_err(|error| Error::Failed(format!("{error:#}; {SIM_HINT}")))?;
-    let source = if is_any_simulated(&rig) { simulate(&rig, real)? } else { Box::new(Live::new(real)?) };
+    let is_any_simulated = is_any_simulated(&rig);
+    // Without real devices, the time of a simulation starts at 0.
+    let stamp_clock =
+        if is_any_simulated && !has_devices(&real) { StampClock::Simulation } else { StampClock::Computer };
+    let source = if is_any_simulated { simulate(&rig, real)? } else { Box::new(Live::new(real)?) };
     let source = match rig.base.driver {
         BaseDriver::Tags => Box::new(TagBaseSource::new(&rig, source)?),
         _ => source,
     };
-    Ok(Opened { rig, source, damage: Arc::default(), stamp_clock: StampClock::Computer })
+    Ok(Opened { rig, source, damage: Arc::default(), stamp_clock })
+}
+
+/// Whether there is any device.
+fn has_devices(devices: &drivers::Devices) -> bool {
+    let drivers::Devices { arm, base, scanners, cameras } = devices;
+    arm.is_some() || base.is_some() || !scanners.is_empty() || !cameras.is_empty()
 }
 
 /// Replaces every device by its simulated twin.

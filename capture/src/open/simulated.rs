@@ -11,7 +11,7 @@ use std::sync::Arc;
 /// parallel.
 pub(super) fn open(rig: &Rig, real: Devices) -> crate::Result<Box<dyn Source>> {
     let mut config = config_of(rig)?;
-    let any_real = real.arm.is_some() || real.base.is_some() || !real.scanners.is_empty() || !real.cameras.is_empty();
+    let any_real = super::has_devices(&real);
     if rig.sim.lockstep {
         if any_real {
             bail!("sim.lockstep does not work with real devices, which cannot wait: set sim.lockstep = false");
