@@ -6,7 +6,7 @@
 
 use drivers::Arm;
 use drivers::franka::emulated::{EmulatedRobot, JointSimulator, Joints, Limits, RobotConfig};
-use drivers::franka::{ArmConfig, ContactConfig, FciVersion, FrankaArm, MotionStatistics, MovableFrankaArm, N_JOINTS};
+use drivers::franka::{ArmConfig, ContactConfig, FciVersion, FrankaArm, MovableFrankaArm, N_JOINTS};
 use drivers::motion::{JointTarget, Motion, MotionConfig, MotionLimits, MovableArm, OnLoss};
 use kinematics::{Chain, Transform};
 use parking_lot::Mutex;
@@ -51,8 +51,7 @@ fn libfranka_moves_emulated_robot_and_recovers_from_reflex() {
     report(&format!("libfranka against the emulated robot: {reported}"));
     let reported: serde_json::Value = serde_json::from_str(&reported).unwrap();
     let number = |key: &str| reported[key].as_f64().unwrap();
-    // The client counts states that arrive together as one cycle.
-    assert!(number("cycles") > 0.9 * 2000.0 && number("answered") > 0.99, "{reported}");
+    assert!(number("cycles") > 0.99 * 2000.0 && number("answered") > 0.999, "{reported}");
     for (ix, by) in reported["moved_rad"].as_array().unwrap().iter().enumerate() {
         let expected = if ix == 3 { 0.2 } else { 0.0 };
         assert!((by.as_f64().unwrap() - expected).abs() < 1e-6, "{reported}");
@@ -60,7 +59,7 @@ fn libfranka_moves_emulated_robot_and_recovers_from_reflex() {
     let stopped = reported["stopped"].as_str().unwrap();
     assert!(stopped.contains("reflex") && stopped.contains("discontinuity"), "{reported}");
     assert!(
-        reported["reflex"] == true && reported["recovered"] == true && number("cycles_again") > 0.9 * 2000.0,
+        reported["reflex"] == true && reported["recovered"] == true && number("cycles_again") > 0.99 * 2000.0,
         "{reported}"
     );
     drop(emulated);
@@ -89,29 +88,26 @@ fn ten_thousand_states_are_received_from_franka_sim() {
 
 #[test]
 fn ten_thousand_motion_cycles_with_both_controllers() {
-    // Our driver answers no state if the one before it arrived more than 20 ms earlier.
-    const ANSWER_WAIT: Duration = Duration::from_millis(15);
     let _alone = ONE_AT_A_TIME.lock();
     let Some(python) = environment() else { return };
+    let server = FrankaSim::start(&python);
     follow_for_ten_thousand_cycles("franka-sim", || {
-        let server = FrankaSim::start(&python);
-        let arm = server.open(|config| MovableFrankaArm::open(config, &motion(), &ContactConfig::default()));
-        (server, arm)
+        server.open(|config| MovableFrankaArm::open(config, &motion(), &ContactConfig::default()))
     });
+    drop(server);
+    let config = RobotConfig {
+        address: (Ipv4Addr::LOCALHOST, 0).into(),
+        version: FciVersion::V10,
+        chain: chain("panda_link8"),
+        flange_from_tool: Transform::identity(),
+        limits: Limits::fr3(),
+    };
+    let emulated = EmulatedRobot::start(config, ideal_joints([0.1, -0.5, 0.2, -2.0, 0.3, 1.8, 0.7])).unwrap();
     let chain = chain("panda_link8");
+    let config =
+        ArmConfig { address: emulated.address().to_string(), joint_names: chain.joint_names().to_vec(), chain };
     follow_for_ten_thousand_cycles("the emulated robot", || {
-        let config = RobotConfig {
-            address: (Ipv4Addr::LOCALHOST, 0).into(),
-            version: FciVersion::V10,
-            chain: chain.clone(),
-            flange_from_tool: Transform::identity(),
-            limits: Limits::fr3(),
-        };
-        let joints = ideal_joints([0.1, -0.5, 0.2, -2.0, 0.3, 1.8, 0.7]);
-        let emulated = EmulatedRobot::start_waiting(config, ANSWER_WAIT, joints).unwrap();
-        let (address, joint_names) = (emulated.address().to_string(), chain.joint_names().to_vec());
-        let config = ArmConfig { address, joint_names, chain: chain.clone() };
-        (emulated, MovableFrankaArm::open(&config, &motion(), &ContactConfig::default()).unwrap())
+        MovableFrankaArm::open(&config, &motion(), &ContactConfig::default()).unwrap()
     });
 }
 
@@ -125,66 +121,47 @@ fn motion() -> MotionConfig {
     }
 }
 
-/// Moves back and forth for 10 000 cycles or more, in short runs, each with a new robot and arm. At least one run must be
-/// in time, and every such run must reach its targets.
+/// Moves back and forth for 10 000 cycles, and checks the statistics on both sides.
 ///
-/// In other runs the machine is too busy, and the robot extrapolates over missed commands, possibly to where no trajectory
-/// leads back.
-fn follow_for_ten_thousand_cycles<R>(name: &str, open: impl Fn() -> (R, MovableFrankaArm)) {
-    const N_CYCLES: u64 = 10_000;
-    const MAX_RUNS: usize = 12;
-    let (mut n_cycles, mut n_in_time) = (0, 0);
-    for _ in 0..MAX_RUNS {
-        let (_robot, mut arm) = open();
-        let outcome = move_back_and_forth(&mut arm);
-        let statistics = arm.motion_statistics();
-        report(&format!("our driver moves {name}: {statistics}\n"));
-        let is_in_time = is_in_time(&statistics);
-        match outcome {
-            Ok(()) => (n_cycles, n_in_time) = (n_cycles + statistics.n_answered, n_in_time + u32::from(is_in_time)),
-            Err(reason) => assert!(!is_in_time, "{name}: {reason}; {statistics}"),
-        }
-        if n_cycles >= N_CYCLES && n_in_time > 0 {
-            return;
-        }
-    }
-    panic!("{name}: {n_cycles} cycles, and {n_in_time} runs in time");
-}
-
-/// Moves back and forth for at least 2500 cycles. Returns the reason if the arm does not reach a target.
-fn move_back_and_forth(arm: &mut MovableFrankaArm) -> Result<(), String> {
-    const N_CYCLES: u64 = 2500;
+/// On a busy machine, up to three attempts are made. A reflex caused by a violated limit fails immediately.
+fn follow_for_ten_thousand_cycles(name: &str, open: impl Fn() -> MovableFrankaArm) {
+    const MAX_ATTEMPTS: usize = 3;
     const BY_RAD: f64 = 0.3;
     const NEAR_RAD: f64 = 5e-3; // The joints of franka-sim have inertia.
-    let rest = arm.read(TEST_TIMEOUT).expect("the arm reports its joints").position;
-    let mut directions = [-1.0, 0.0, 1.0, 0.0].into_iter().cycle();
-    while arm.motion_statistics().n_answered < N_CYCLES {
-        let by_rad = BY_RAD * directions.next().expect("the iterator is infinite");
-        let target = JointTarget { position: rest.iter().map(|rest| rest + by_rad).collect() };
-        assert_eq!(arm.command(&target).map_err(|error| error.to_string())?, target);
-        let until = Instant::now() + TEST_TIMEOUT;
-        while arm.motion() == Motion::Moving {
-            if Instant::now() > until {
-                return Err("the arm does not come to rest".to_owned());
+    for attempt in 1..=MAX_ATTEMPTS {
+        let mut arm = open();
+        let rest = arm.read(TEST_TIMEOUT).expect("the arm reports its joints").position;
+        let mut directions = [-1.0, 0.0, 1.0, 0.0].into_iter().cycle();
+        while arm.motion_statistics().n_answered < 10_000 {
+            let by_rad = BY_RAD * directions.next().expect("the iterator is infinite");
+            let target = JointTarget { position: rest.iter().map(|rest| rest + by_rad).collect() };
+            assert_eq!(arm.command(&target).expect("a target within range"), target);
+            let until = Instant::now() + TEST_TIMEOUT;
+            while arm.motion() == Motion::Moving {
+                assert!(Instant::now() < until, "the arm does not come to rest: {}", arm.motion_statistics());
+                std::thread::sleep(Duration::from_millis(5));
             }
-            std::thread::sleep(Duration::from_millis(5));
+            if let Motion::Stopped { reason } = arm.motion() {
+                assert!(reason.contains("communication_constraints_violation"), "{name}: {reason}");
+                arm.recover().expect("the arm recovers");
+                continue;
+            }
+            let position = settled_position(&mut arm);
+            let off = position
+                .iter()
+                .zip(&target.position)
+                .map(|(actual, expected)| (actual - expected).abs())
+                .fold(0.0, f64::max);
+            assert!(off < NEAR_RAD, "{name}: {off} rad from its target");
         }
-        if let Motion::Stopped { reason } = arm.motion() {
-            return Err(reason);
+        let statistics = arm.motion_statistics();
+        report(&format!("our driver moves {name}: {statistics}\n"));
+        let [reported, _] = statistics.robot_success_frac().expect("the arm has moved");
+        if statistics.success_frac() > 0.99 && reported > 0.99 && statistics.n_motions > 0 {
+            return;
         }
-        let errors = std::iter::zip(settled_position(arm), target.position).map(|(is, target)| (is - target).abs());
-        let off = errors.fold(0.0, f64::max);
-        if off > NEAR_RAD {
-            return Err(format!("the arm is {off} rad from its target"));
-        }
+        assert!(attempt < MAX_ATTEMPTS, "{name}: {statistics}");
     }
-    Ok(())
-}
-
-/// Whether at least 99 % of the commands were sent, and received by the robot, in time.
-fn is_in_time(statistics: &MotionStatistics) -> bool {
-    let received_frac = statistics.robot_success_frac().map_or(0.0, |[mean, _]| mean);
-    statistics.success_frac() > 0.99 && received_frac > 0.99
 }
 
 /// Joint positions after the arm has come to rest. Skips older states in the queue.

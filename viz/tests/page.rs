@@ -353,8 +353,8 @@ fn check_images(browser: &mut Browser) {
         browser.evaluate("document.querySelector('#docked canvas').height").as_u64() == Some(small)
     });
     save_and_restore(browser, "docked");
-    browser.evaluate("void setTimeout(() => location.reload(), 0)");
-    std::thread::sleep(Duration::from_millis(200));
+    browser.evaluate("window.isBeforeReload = true; void setTimeout(() => location.reload(), 0)");
+    wait_for(browser, "the reload", |browser| browser.evaluate("window.isBeforeReload ?? false") == false);
     wait_for(browser, "the image in the side panel after a reload", |browser| browser.evaluate(docked) == 1);
     wait_for(browser, "a full picture", |browser| browser.text("picture-text").contains("100 %"));
     browser.click("toggle-images");

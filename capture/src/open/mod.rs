@@ -108,22 +108,15 @@ pub fn rig(mut rig: Rig, devices: Devices) -> crate::Result<Opened> {
         check_intrinsics(&rig)?;
     }
     let real = real::open(&mut rig).map_err(|error| Error::Failed(format!("{error:#}; {SIM_HINT}")))?;
-    let is_any_simulated = is_any_simulated(&rig);
-    // Without real devices, the time of a simulation starts at 0.
-    let stamp_clock =
-        if is_any_simulated && !has_devices(&real) { StampClock::Simulation } else { StampClock::Computer };
-    let source = if is_any_simulated { simulate(&rig, real)? } else { Box::new(Live::new(real)?) };
+    let (source, stamp_clock): (Box<dyn Source>, _) = match is_any_simulated(&rig) {
+        true => simulate(&rig, real)?,
+        false => (Box::new(Live::new(real)?), StampClock::Computer),
+    };
     let source = match rig.base.driver {
         BaseDriver::Tags => Box::new(TagBaseSource::new(&rig, source)?),
         _ => source,
     };
     Ok(Opened { rig, source, damage: Arc::default(), stamp_clock })
-}
-
-/// Whether there is any device.
-fn has_devices(devices: &drivers::Devices) -> bool {
-    let drivers::Devices { arm, base, scanners, cameras } = devices;
-    arm.is_some() || base.is_some() || !scanners.is_empty() || !cameras.is_empty()
 }
 
 /// Replaces every device by its simulated twin.
@@ -257,7 +250,7 @@ fn unsupported_device(rig: &Rig) -> Option<String> {
 }
 
 #[cfg(feature = "sim")]
-fn simulate(rig: &Rig, real: drivers::Devices) -> crate::Result<Box<dyn Source>> {
+fn simulate(rig: &Rig, real: drivers::Devices) -> crate::Result<(Box<dyn Source>, StampClock)> {
     simulated::open(rig, real)
 }
 
@@ -272,7 +265,7 @@ fn base_moves(_scene: &str) -> bool {
 }
 
 #[cfg(not(feature = "sim"))]
-fn simulate(_rig: &Rig, _real: drivers::Devices) -> crate::Result<Box<dyn Source>> {
+fn simulate(_rig: &Rig, _real: drivers::Devices) -> crate::Result<(Box<dyn Source>, StampClock)> {
     bail!("this program was built without the simulator: build it with `cargo build --release --features sim`")
 }
 

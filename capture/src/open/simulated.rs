@@ -1,5 +1,6 @@
 //! Opens the simulated twin of a rig: the same cameras and joints in MuJoCo.
 
+use crate::StampClock;
 use crate::config::{BaseDriver, Camera, CameraDriver, Depth, Parent, Rig, Scanner, ScannerDriver, SimTarget};
 use drivers::motion::MotionLimits;
 use drivers::{Devices, Error, Live, Sample, Source};
@@ -8,18 +9,21 @@ use kinematics::{Intrinsics, Stamp, Transform};
 use std::sync::Arc;
 
 /// Opens the simulated rig, in lockstep or in real time according to the rig file. In real time, `real` devices run in
-/// parallel.
-pub(super) fn open(rig: &Rig, real: Devices) -> crate::Result<Box<dyn Source>> {
+/// parallel. Also returns the clock of the stamps.
+pub(super) fn open(rig: &Rig, real: Devices) -> crate::Result<(Box<dyn Source>, StampClock)> {
     let mut config = config_of(rig)?;
-    let any_real = super::has_devices(&real);
+    let any_real = real.arm.is_some() || real.base.is_some() || !real.scanners.is_empty() || !real.cameras.is_empty();
     if rig.sim.lockstep {
         if any_real {
             bail!("sim.lockstep does not work with real devices, which cannot wait: set sim.lockstep = false");
         }
-        return Ok(Box::new(sim::open(&config)?.into_lockstep()));
+        return Ok((Box::new(sim::open(&config)?.into_lockstep()), StampClock::Simulation));
     }
     // Real devices use the clock of this computer. Without them, the simulation starts at 0.
-    let start = if any_real { drivers::clock::now() } else { Stamp::default() };
+    let (start, stamp_clock) = match any_real {
+        true => (drivers::clock::now(), StampClock::Computer),
+        false => (Stamp::default(), StampClock::Simulation),
+    };
     // In real time the limits are checked here, because devices that end would look like devices that fail.
     (config.duration_secs, config.n_images) = (None, None);
     let sim::LiveRig { mut devices, truth, .. } = sim::open(&config)?.into_live(start)?;
@@ -27,13 +31,14 @@ pub(super) fn open(rig: &Rig, real: Devices) -> crate::Result<Box<dyn Source>> {
     devices.base = devices.base.or(real.base);
     devices.scanners.extend(real.scanners);
     devices.cameras.extend(real.cameras);
-    Ok(Box::new(RealTime {
+    let source = RealTime {
         live: Live::new(devices)?,
         truth,
         first_camera: Arc::clone(&rig.cameras[0].name),
         n_left: rig.sim.n_images,
         end: rig.sim.duration_secs.map(|secs| start.plus_secs(secs)),
-    }))
+    };
+    Ok((Box::new(source), stamp_clock))
 }
 
 /// Opens a simulated rig with an arm that moves by commands.

@@ -15,6 +15,8 @@ use std::time::{Duration, Instant};
 
 /// How long a robot waits for our driver, which answers no state if the one before it arrived more than 20 ms earlier.
 const ANSWER_WAIT: Duration = Duration::from_millis(15);
+/// Number of states without an answer after which a robot stops; two commands may still be on their way.
+const MAX_WITHOUT_ANSWER: u64 = 22;
 /// Set in the child process that [`suspended_program_triggers_reflex_and_sends_nothing_stale`] suspends and resumes.
 const CHILD: &str = "FIELDRIG_TEST_FCI";
 
@@ -41,6 +43,17 @@ fn recording_joints() -> (JointSimulator, Arc<Mutex<CommandedJoints>>) {
         follow_command(stamp, commanded)
     });
     (joint_simulator, last_command)
+}
+
+/// Also counts the states that the robot sends during motions.
+fn with_counter(mut joint_simulator: JointSimulator) -> (JointSimulator, Arc<AtomicU64>) {
+    let n_moving = Arc::new(AtomicU64::new(0));
+    let counter = Arc::clone(&n_moving);
+    let counting: JointSimulator = Box::new(move |stamp, commanded| {
+        counter.fetch_add(u64::from(commanded.is_moving), Ordering::Relaxed);
+        joint_simulator(stamp, commanded)
+    });
+    (counting, n_moving)
 }
 
 fn offset_from_rest(by_rad: [f64; N_JOINTS]) -> JointTarget {
@@ -71,8 +84,8 @@ fn wait_until(condition: impl Fn() -> bool, expected: &str) {
 
 /// Performs an action and waits until the arm is at rest.
 ///
-/// If the machine is so busy that the arm's thread misses 20 waits of the robot, the robot correctly triggers a reflex.
-/// The action is then retried.
+/// If the machine is so busy that the arm's thread answers more than 20 states in a row too late, the robot correctly
+/// triggers a reflex. The action is then retried.
 fn retry_until_settled(arm: &mut MovableFrankaArm, mut act: impl FnMut(&mut MovableFrankaArm) -> Result<(), String>) {
     const MAX_ATTEMPTS: usize = 5;
     for _ in 0..MAX_ATTEMPTS {
@@ -367,6 +380,7 @@ fn lossy_network_is_reported_and_motions_complete() {
 #[test]
 fn disconnect_triggers_reflex_and_arm_recovers() {
     let (joint_simulator, last_command) = recording_joints();
+    let (joint_simulator, n_moving) = with_counter(joint_simulator);
     let emulated = waiting_robot(FciVersion::V10, ANSWER_WAIT, joint_simulator);
     let relay = Relay::start(emulated.address());
     let mut arm = open(relay.address);
@@ -374,7 +388,10 @@ fn disconnect_triggers_reflex_and_arm_recovers() {
     command_target(&mut arm, &far).unwrap();
     std::thread::sleep(Duration::from_millis(500));
     relay.faults.is_disconnected.store(true, Ordering::Relaxed);
+    let n_before = n_moving.load(Ordering::Relaxed);
     wait_until(|| !last_command.lock().unwrap().is_moving, "the robot stops on its own");
+    let n_without_answer = n_moving.load(Ordering::Relaxed) - n_before;
+    assert!(n_without_answer <= MAX_WITHOUT_ANSWER, "the robot stopped after {n_without_answer} states");
     relay.faults.is_disconnected.store(false, Ordering::Relaxed);
     let reason = settle(&arm).unwrap_err();
     assert!(reason.contains("communication_constraints_violation"), "{reason}");
@@ -410,6 +427,7 @@ fn child_program_moves_arm() {
 #[test]
 fn suspended_program_triggers_reflex_and_sends_nothing_stale() {
     let (joint_simulator, last_command) = recording_joints();
+    let (joint_simulator, n_moving) = with_counter(joint_simulator);
     let emulated = waiting_robot(FciVersion::V10, ANSWER_WAIT, joint_simulator);
     let relay = Relay::start(emulated.address());
     let mut child = Command::new(std::env::current_exe().unwrap())
@@ -430,7 +448,10 @@ fn suspended_program_triggers_reflex_and_sends_nothing_stale() {
     assert_eq!(text(), "moving");
     std::thread::sleep(Duration::from_millis(300));
     signal("-STOP");
+    let n_before = n_moving.load(Ordering::Relaxed);
     wait_until(|| !last_command.lock().unwrap().is_moving, "the robot stops on its own");
+    let n_without_answer = n_moving.load(Ordering::Relaxed) - n_before;
+    assert!(n_without_answer <= MAX_WITHOUT_ANSWER, "the robot stopped after {n_without_answer} states");
     let n_commands = relay.faults.n_commands.load(Ordering::Relaxed);
     assert!(n_commands > 50, "{n_commands}");
     signal("-CONT");

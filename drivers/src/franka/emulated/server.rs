@@ -5,7 +5,7 @@ pub(crate) mod fuzz;
 
 use super::super::{N_JOINTS, realtime};
 use super::message::{Command, Reply, Request};
-use super::robot::{Mode, Robot};
+use super::robot::Robot;
 use super::{CommandedJoints, JointSimulator, RobotConfig};
 use crate::{Error, clock};
 use franka::FciVersion;
@@ -134,8 +134,13 @@ impl Server {
             let due = start_time + STEP * n_steps;
             let now = clock::now();
             let lag = now.duration_since(due);
-            let max_lag = if matches!(self.robot.mode, Mode::Move(_)) { MAX_MOTION_LAG } else { MAX_LAG };
-            if lag > max_lag && !self.waits_for_answer() {
+            let max_lag = match self.robot.commanded.is_moving {
+                // The answers to late states are awaited, too.
+                true if !self.answer_wait.is_zero() => Duration::MAX,
+                true => MAX_MOTION_LAG,
+                false => MAX_LAG,
+            };
+            if lag > max_lag {
                 let n_skipped = u32::try_from(lag.as_millis()).unwrap_or(u32::MAX);
                 (n_steps, number) = (n_steps.saturating_add(n_skipped), number + u64::from(n_skipped));
                 continue;
@@ -148,7 +153,7 @@ impl Server {
 
     /// Simulates one millisecond: handles requests, advances the motion, sends the state.
     fn step(&mut self, due: Stamp, number: u64, is_late: bool) {
-        let waits_for_answer = self.waits_for_answer();
+        let wait = if self.robot.commanded.is_moving { self.answer_wait } else { Duration::ZERO };
         if let Some(mut client) = self.client.take() {
             match client.read_requests(&mut self.robot) {
                 Ok(()) => self.client = Some(client),
@@ -156,10 +161,9 @@ impl Server {
             }
         }
         self.accept_client();
-        let wait = if waits_for_answer { self.answer_wait } else { Duration::ZERO };
         let command = self.command(number - 1, wait);
         // If several states are overdue, only the last one can have been answered.
-        let could_answer = waits_for_answer || !is_late;
+        let could_answer = !is_late || !wait.is_zero();
         let finished = self.robot.follow(command.as_ref(), could_answer);
         let joints = (self.joint_simulator)(due, &self.robot.commanded);
         let contact = self.robot.observe(joints);
@@ -188,11 +192,6 @@ impl Server {
                 self.client = Some(Client { stream, ip: peer.ip(), states_to: None, buffer_in: Vec::new() });
             }
         }
-    }
-
-    /// Whether the answer to the last state may be late.
-    fn waits_for_answer(&self) -> bool {
-        !self.answer_wait.is_zero() && matches!(self.robot.mode, Mode::Move(_))
     }
 
     /// The client's answer to the state with this number, if it arrives within `wait`. A datagram that is not a command
