@@ -8,13 +8,18 @@ use drivers::Arm;
 use drivers::franka::emulated::{EmulatedRobot, JointSimulator, Joints, Limits, RobotConfig};
 use drivers::franka::{ArmConfig, ContactConfig, FciVersion, FrankaArm, MovableFrankaArm, N_JOINTS};
 use drivers::motion::{JointTarget, Motion, MotionConfig, MotionLimits, MovableArm, OnLoss};
+use franka::realtime::set_current_thread_scheduler_priority;
 use kinematics::{Chain, Transform};
 use parking_lot::Mutex;
+use rustix::thread::{CpuSet, sched_getaffinity, sched_setaffinity};
 use std::fs;
 use std::io::Write;
 use std::net::{Ipv4Addr, SocketAddr, TcpListener};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 /// If set to `demand`, the tests fail instead of being skipped on a machine that cannot run them. `.ci/run` sets it.
@@ -121,7 +126,8 @@ fn motion() -> MotionConfig {
     }
 }
 
-/// Moves back and forth for 10 000 cycles, and checks the statistics on both sides.
+/// Moves back and forth for 10 000 cycles, and checks the statistics on both sides: 99 % of the states are answered in
+/// time, not counting those during which a processor of the machine was stalled.
 ///
 /// On a busy machine, up to three attempts are made. A reflex caused by a violated limit fails immediately.
 fn follow_for_ten_thousand_cycles(name: &str, open: impl Fn() -> MovableFrankaArm) {
@@ -129,6 +135,7 @@ fn follow_for_ten_thousand_cycles(name: &str, open: impl Fn() -> MovableFrankaAr
     const BY_RAD: f64 = 0.3;
     const NEAR_RAD: f64 = 5e-3; // The joints of franka-sim have inertia.
     for attempt in 1..=MAX_ATTEMPTS {
+        let stalls = Stalls::start();
         let mut arm = open();
         let rest = arm.read(TEST_TIMEOUT).expect("the arm reports its joints").position;
         let mut directions = [-1.0, 0.0, 1.0, 0.0].into_iter().cycle();
@@ -155,12 +162,57 @@ fn follow_for_ten_thousand_cycles(name: &str, open: impl Fn() -> MovableFrankaAr
             assert!(off < NEAR_RAD, "{name}: {off} rad from its target");
         }
         let statistics = arm.motion_statistics();
-        report(&format!("our driver moves {name}: {statistics}\n"));
+        let n_stalled = stalls.n_cycles();
+        report(&format!("our driver moves {name}: {statistics}; stalled for {n_stalled} cycles\n"));
         let [reported, _] = statistics.robot_success_frac().expect("the arm has moved");
-        if statistics.success_frac() > 0.99 && reported > 0.99 && statistics.n_motions > 0 {
+        let min_frac = 0.99 - n_stalled as f64 / (statistics.n_cycles + statistics.n_lost) as f64;
+        if statistics.success_frac() > min_frac && reported > min_frac && statistics.n_motions > 0 {
             return;
         }
-        assert!(attempt < MAX_ATTEMPTS, "{name}: {statistics}");
+        assert!(attempt < MAX_ATTEMPTS, "{name}: {statistics}; stalled for {n_stalled} cycles");
+    }
+}
+
+/// Measures how long each processor was stalled, because the host of a virtual machine took it away or another program
+/// occupied it.
+struct Stalls {
+    is_over: Arc<AtomicBool>,
+    threads: Vec<JoinHandle<u64>>,
+}
+
+impl Stalls {
+    /// Starts one thread per processor, which sleeps for one cycle at a time and measures how late it wakes up.
+    fn start() -> Self {
+        /// Above the driver and the emulated robot: time that they use must not count as a stall.
+        const PRIORITY: i32 = 90;
+        let is_over = Arc::new(AtomicBool::new(false));
+        let available = sched_getaffinity(None).expect("the processors are known");
+        let start_on = |cpu| {
+            let is_over = Arc::clone(&is_over);
+            std::thread::spawn(move || {
+                let mut only = CpuSet::new();
+                only.set(cpu);
+                sched_setaffinity(None, &only).expect("the processor is available");
+                // Where this is denied, the driver has no priority either.
+                let _ = set_current_thread_scheduler_priority(PRIORITY);
+                let (mut n_cycles, mut last) = (0, Instant::now());
+                while !is_over.load(Ordering::Relaxed) {
+                    std::thread::sleep(Duration::from_millis(1));
+                    let now = Instant::now();
+                    n_cycles += u64::try_from((now - last).as_millis()).expect("a short time") - 1;
+                    last = now;
+                }
+                n_cycles
+            })
+        };
+        let threads = (0..CpuSet::MAX_CPU).filter(|cpu| available.is_set(*cpu)).map(start_on).collect();
+        Self { is_over, threads }
+    }
+
+    /// Number of cycles of 1 ms, summed over the processors.
+    fn n_cycles(self) -> u64 {
+        self.is_over.store(true, Ordering::Relaxed);
+        self.threads.into_iter().map(|thread| thread.join().expect("the thread does not panic")).sum()
     }
 }
 

@@ -3,7 +3,7 @@
 
 use super::limits::RobotLimits;
 use super::mailbox::{MotionCommand, MotionMailbox};
-use super::reference::{CommandFate, Reference};
+use super::reference::{CommandFate, Reference, ReferenceTracker};
 use super::request::{self, MotionResponse};
 use super::session::{Session, error_text};
 use super::state::NumberedState;
@@ -68,7 +68,7 @@ enum MotionState {
 struct ActiveMotion {
     id: u32,
     generator: TrajectoryGenerator,
-    reference: Reference,
+    tracker: ReferenceTracker,
     /// Number of the newest state.
     number: u64,
     /// The position sent in answer to the newest state.
@@ -153,7 +153,7 @@ impl MotionLoop {
         let active = ActiveMotion {
             id,
             generator,
-            reference,
+            tracker: ReferenceTracker::new(reference),
             number: numbered.number,
             sent: None,
             n_cycles: 0,
@@ -167,11 +167,11 @@ impl MotionLoop {
     fn run(&mut self, mut active: Box<ActiveMotion>, stamped: &StampedState<'_>) -> MotionState {
         let NumberedState { number, state } = stamped.numbered;
         let n_states = number.saturating_sub(active.number);
-        let (reference, fate) = match n_states {
-            0 => (active.reference, CommandFate::Followed),
-            n => active.reference.advance(active.sent, n, state),
+        let fate = match n_states {
+            0 => CommandFate::Followed,
+            n => active.tracker.advance(active.sent, n, state),
         };
-        (active.reference, active.number, active.sent) = (reference, *number, None);
+        (active.number, active.sent) = (*number, None);
         let command = self.take_command(&mut active, n_states, fate, stamped);
         let position_rad = match self.next_position(&mut active, command.as_ref(), fate) {
             Ok(position_rad) => position_rad,
@@ -222,7 +222,8 @@ impl MotionLoop {
         command: Option<&MotionCommand>,
         fate: CommandFate,
     ) -> Result<[f64; super::N_JOINTS], String> {
-        let ActiveMotion { generator, reference, .. } = active;
+        let ActiveMotion { generator, tracker, .. } = active;
+        let reference = tracker.reference();
         match command {
             Some(MotionCommand::SetTarget(target)) => drop(generator.set_target(target)?),
             Some(MotionCommand::Stop) => generator.stop(),

@@ -11,12 +11,14 @@ const STEP_SECS: f64 = rate_limiting::DELTA_T;
 const POSITION_TOLERANCE_RAD: f64 = 4e-7;
 /// Maximum velocity difference between our reference and the robot's, for velocities up to 8 rad/s.
 const VELOCITY_TOLERANCE_RAD_S: f64 = 1e-6;
-/// Maximum number of steps by which a reported reference may be behind: `franka-sim` reports what its joint thread
-/// has processed.
+/// Maximum number of steps by which a reported reference or success rate may be behind: `franka-sim` reports what its
+/// joint thread has processed.
 const MAX_BEHIND: f64 = 3.0;
 /// Number of consecutive missing commands after which the robot stops. Source: FCI documentation, "Real-time control
 /// commands".
 const MAX_MISSED: u64 = 20;
+/// Number of commands from which the robot computes its success rate.
+const SUCCESS_WINDOW: f64 = 100.0;
 
 /// Commanded joint positions, rad, with velocities and accelerations as differences per millisecond, as the robot
 /// computes them.
@@ -36,6 +38,53 @@ pub(super) enum CommandFate {
     Missed(u64),
     /// The robot's reference is elsewhere.
     Unknown,
+}
+
+/// Tracks the robot's reference during one motion.
+#[derive(Debug)]
+pub(super) struct ReferenceTracker {
+    reference: Reference,
+    /// The reference if the robot has received all commands since it last certainly followed one.
+    if_all_received: Reference,
+    /// Number of consecutive commands that the robot seems to have missed.
+    n_missed: u64,
+}
+
+impl ReferenceTracker {
+    pub(super) fn new(reference: Reference) -> Self {
+        Self { reference, if_all_received: reference, n_missed: 0 }
+    }
+
+    pub(super) fn reference(&self) -> &Reference {
+        &self.reference
+    }
+
+    /// Advances by `n_states`, of which the first was answered with `sent`. See [`Reference::advance`].
+    ///
+    /// A command that is wrongly taken for missed displaces our reference by its small effect. The next command then has
+    /// the same effect on the robot as a missing one, and so on: the robot would accelerate for as long as the jerk stays
+    /// the same. The success rate that the robot reports shows this mistake: it bounds the number of missed commands.
+    pub(super) fn advance(&mut self, sent: Option<[f64; N_JOINTS]>, n_states: u64, state: &RobotState) -> CommandFate {
+        let (reference, fate) = self.reference.advance(sent, n_states, state);
+        self.reference = reference;
+        match fate {
+            CommandFate::Missed(n) => {
+                self.if_all_received = self.if_all_received.after(sent, n_states);
+                self.n_missed += n;
+            }
+            _ => (self.if_all_received, self.n_missed) = (reference, 0),
+        }
+        if self.n_missed as f64 <= n_lost(state) + MAX_BEHIND {
+            return fate;
+        }
+        (self.reference, self.n_missed) = (self.if_all_received, 0);
+        CommandFate::Unknown
+    }
+}
+
+/// Number of commands that the robot has missed among the last ones, according to its success rate.
+fn n_lost(state: &RobotState) -> f64 {
+    ((1.0 - state.control_command_success_rate) * SUCCESS_WINDOW).round()
 }
 
 impl Reference {
@@ -67,6 +116,12 @@ impl Reference {
         }
     }
 
+    /// The reference after `n` states, of which the first was answered with `sent`.
+    fn after(&self, sent: Option<[f64; N_JOINTS]>, n: u64) -> Self {
+        let first = sent.map_or_else(|| self.missed(), |position_rad| self.sent(position_rad));
+        (1..n).fold(first, |reference, _| reference.missed())
+    }
+
     /// Advances the reference by `n_states`, of which the first was answered with `sent`, and returns the outcome of
     /// that command.
     ///
@@ -84,7 +139,6 @@ impl Reference {
         if n_states > MAX_MISSED {
             return (reported, CommandFate::Unknown);
         }
-        let extrapolate = |from: Self, n: u64| (0..n).fold(from, |reference, _| reference.missed());
         let is_near = |reference: &Self| {
             let pairs = reference.position_rad.into_iter().zip(reported.position_rad);
             pairs.into_iter().all(|(own, robot)| (own - robot).abs() <= POSITION_TOLERANCE_RAD)
@@ -93,16 +147,17 @@ impl Reference {
             let pairs = reference.velocity_rad_s.into_iter().zip(reported.velocity_rad_s);
             pairs.into_iter().all(|(own, robot)| (own - robot).abs() <= VELOCITY_TOLERANCE_RAD_S)
         };
-        let n_after = n_states.saturating_sub(1);
-        let if_received = sent.map(|position_rad| extrapolate(self.sent(position_rad), n_after)).filter(is_near);
-        let if_missed = extrapolate(*self, n_states);
+        let n_after = n_states - 1;
+        let if_sent_received = sent.map(|position_rad| self.after(Some(position_rad), n_states));
+        let if_received = if_sent_received.filter(is_near);
+        let if_missed = self.after(None, n_states);
         match if_received {
             Some(if_received) if !matches_rates(&if_received) && matches_rates(&if_missed) && !matches_rates(self) => {
                 (if_missed, CommandFate::Missed(n_states))
             }
             Some(if_received) if n_after == 0 => (if_received, CommandFate::Followed),
             Some(if_received) => (if_received, CommandFate::Missed(n_after)),
-            None => match sent.map(|position_rad| extrapolate(self.sent(position_rad), n_after)) {
+            None => match if_sent_received {
                 _ if is_near(&if_missed) => (if_missed, CommandFate::Missed(n_states)),
                 Some(if_received) if n_after == 0 && if_received.is_shortly_after(&reported) => {
                     (if_received, CommandFate::Followed)
@@ -185,6 +240,31 @@ mod tests {
         let mut smoothed = followed;
         smoothed.velocity_rad_s = [0.29; N_JOINTS];
         assert_eq!(reference.advance(Some(next), 1, &state(&smoothed)), (followed, CommandFate::Followed));
+    }
+
+    #[test]
+    fn wrongly_missed_command_does_not_displace_reference_for_long() {
+        const JERK_RAD_S3: f64 = -10.0;
+        const MAX_DISPLACED: usize = 8; // 3 reported losses, and as many steps as the report may be behind.
+        let next = |reference: &Reference| {
+            reference.missed().position_rad.map(|position| position + JERK_RAD_S3 * STEP_SECS.powi(3) / 6.0)
+        };
+        // The robot has received the last command, but our reference does not contain it.
+        let (earlier, _) = moving(JERK_RAD_S3);
+        let mut robot = earlier.sent(next(&earlier));
+        let mut tracker = ReferenceTracker::new(earlier.missed());
+        let mut n_displaced = 0;
+        for _ in 0..60 {
+            let sent = next(tracker.reference());
+            robot = robot.sent(sent);
+            let mut reported = state(&robot);
+            reported.control_command_success_rate = 0.97;
+            n_displaced += usize::from(tracker.advance(Some(sent), 1, &reported) != CommandFate::Followed);
+        }
+        assert!((1..=MAX_DISPLACED).contains(&n_displaced), "{n_displaced} commands");
+        let expected = 0.7 + (60 - n_displaced) as f64 * JERK_RAD_S3 * STEP_SECS / 6.0;
+        assert!((robot.acceleration_rad_s2[0] - expected).abs() < 5e-3, "{robot:?}, expected {expected}");
+        assert!((robot.position_rad[0] - tracker.reference().position_rad[0]).abs() < 1e-12, "{tracker:?}");
     }
 
     #[test]
