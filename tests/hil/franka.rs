@@ -6,12 +6,12 @@
 
 use drivers::Arm;
 use drivers::franka::emulated::{EmulatedRobot, JointSimulator, Joints, Limits, RobotConfig};
-use drivers::franka::{ArmConfig, ContactConfig, FciVersion, FrankaArm, MovableFrankaArm, N_JOINTS};
+use drivers::franka::{ArmConfig, ContactConfig, FciVersion, FrankaArm, MotionStatistics, MovableFrankaArm, N_JOINTS};
 use drivers::motion::{JointTarget, Motion, MotionConfig, MotionLimits, MovableArm, OnLoss};
-use franka::realtime::set_current_thread_scheduler_priority;
+use franka::realtime::{pin_current_thread_to_cpu, set_current_thread_scheduler_priority};
 use kinematics::{Chain, Transform};
 use parking_lot::Mutex;
-use rustix::thread::{CpuSet, sched_getaffinity, sched_setaffinity};
+use std::collections::HashSet;
 use std::fs;
 use std::io::Write;
 use std::net::{Ipv4Addr, SocketAddr, TcpListener};
@@ -126,18 +126,19 @@ fn motion() -> MotionConfig {
     }
 }
 
-/// Moves back and forth for 10 000 cycles, and checks the statistics on both sides: 99 % of the states are answered in
-/// time, not counting those during which a processor of the machine was stalled.
+/// Moves back and forth for 10 000 cycles. Checks on both sides that more than 99 % of the states are answered in time,
+/// not counting the time for which a processor was stalled.
 ///
 /// On a busy machine, up to three attempts are made. A reflex caused by a violated limit fails immediately.
 fn follow_for_ten_thousand_cycles(name: &str, open: impl Fn() -> MovableFrankaArm) {
     const MAX_ATTEMPTS: usize = 3;
     const BY_RAD: f64 = 0.3;
     const NEAR_RAD: f64 = 5e-3; // The joints of franka-sim have inertia.
+    const MAX_STALLED_FRAC: f64 = 0.2;
     for attempt in 1..=MAX_ATTEMPTS {
-        let stalls = Stalls::start();
         let mut arm = open();
         let rest = arm.read(TEST_TIMEOUT).expect("the arm reports its joints").position;
+        let stalls = Stalls::start();
         let mut directions = [-1.0, 0.0, 1.0, 0.0].into_iter().cycle();
         while arm.motion_statistics().n_answered < 10_000 {
             let by_rad = BY_RAD * directions.next().expect("the iterator is infinite");
@@ -162,57 +163,70 @@ fn follow_for_ten_thousand_cycles(name: &str, open: impl Fn() -> MovableFrankaAr
             assert!(off < NEAR_RAD, "{name}: {off} rad from its target");
         }
         let statistics = arm.motion_statistics();
-        let n_stalled = stalls.n_cycles();
-        report(&format!("our driver moves {name}: {statistics}; stalled for {n_stalled} cycles\n"));
-        let [reported, _] = statistics.robot_success_frac().expect("the arm has moved");
-        let min_frac = 0.99 - n_stalled as f64 / (statistics.n_cycles + statistics.n_lost) as f64;
-        if statistics.success_frac() > min_frac && reported > min_frac && statistics.n_motions > 0 {
+        let stalled_ms = stalls.stop();
+        let outcome = format!("{name}: {statistics}; stalled for {stalled_ms} ms");
+        report(&format!("our driver moves {outcome}\n"));
+        let stalled_frac = stalled_ms as f64 / (statistics.n_cycles + statistics.n_lost) as f64;
+        if stalled_frac < MAX_STALLED_FRAC && is_in_time(&statistics, stalled_frac) {
             return;
         }
-        assert!(attempt < MAX_ATTEMPTS, "{name}: {statistics}; stalled for {n_stalled} cycles");
+        assert!(attempt < MAX_ATTEMPTS, "{outcome}");
     }
 }
 
-/// Measures how long each processor was stalled, because the host of a virtual machine took it away or another program
-/// occupied it.
+/// Whether more than 99 % of the states were answered in time according to both sides, not counting a fraction of them.
+fn is_in_time(statistics: &MotionStatistics, stalled_frac: f64) -> bool {
+    let [reported, _] = statistics.robot_success_frac().expect("the arm has moved");
+    statistics.n_motions > 0 && statistics.success_frac().min(reported) > 0.99 - stalled_frac
+}
+
+/// Measures when a processor could not run even a thread of high priority, for example because the host ran another
+/// virtual machine. Without real-time priority, the load of other programs and of this one counts, too.
 struct Stalls {
     is_over: Arc<AtomicBool>,
-    threads: Vec<JoinHandle<u64>>,
+    threads: Vec<JoinHandle<Vec<u128>>>,
 }
 
 impl Stalls {
-    /// Starts one thread per processor, which sleeps for one cycle at a time and measures how late it wakes up.
+    /// Starts one thread per processor. It sleeps for 1 ms at a time and records the milliseconds by which it wakes up
+    /// late.
     fn start() -> Self {
-        /// Above the driver and the emulated robot: time that they use must not count as a stall.
+        /// Higher than the priority of the driver and the emulated robot, so that their computing time does not count as
+        /// a stall.
         const PRIORITY: i32 = 90;
         let is_over = Arc::new(AtomicBool::new(false));
-        let available = sched_getaffinity(None).expect("the processors are known");
+        let start = Instant::now();
         let start_on = |cpu| {
             let is_over = Arc::clone(&is_over);
             std::thread::spawn(move || {
-                let mut only = CpuSet::new();
-                only.set(cpu);
-                sched_setaffinity(None, &only).expect("the processor is available");
-                // Where this is denied, the driver has no priority either.
-                let _ = set_current_thread_scheduler_priority(PRIORITY);
-                let (mut n_cycles, mut last) = (0, Instant::now());
+                // If this is denied, the thread measures less accurately.
+                let _ = pin_current_thread_to_cpu(cpu).and_then(|()| set_current_thread_scheduler_priority(PRIORITY));
+                let (mut stalled_ms, mut last) = (Vec::new(), start.elapsed());
                 while !is_over.load(Ordering::Relaxed) {
                     std::thread::sleep(Duration::from_millis(1));
-                    let now = Instant::now();
-                    n_cycles += u64::try_from((now - last).as_millis()).expect("a short time") - 1;
+                    let now = start.elapsed();
+                    let n_late = (now - last).as_millis().saturating_sub(1);
+                    stalled_ms.extend(now.as_millis() - n_late..now.as_millis());
                     last = now;
                 }
-                n_cycles
+                stalled_ms
             })
         };
-        let threads = (0..CpuSet::MAX_CPU).filter(|cpu| available.is_set(*cpu)).map(start_on).collect();
-        Self { is_over, threads }
+        let n_cpus = std::thread::available_parallelism().expect("the number of processors is known").get();
+        Self { threads: (0..n_cpus).map(start_on).collect(), is_over }
     }
 
-    /// Number of cycles of 1 ms, summed over the processors.
-    fn n_cycles(self) -> u64 {
+    /// Stops the threads, and returns for how many milliseconds at least one processor was stalled.
+    fn stop(mut self) -> usize {
         self.is_over.store(true, Ordering::Relaxed);
-        self.threads.into_iter().map(|thread| thread.join().expect("the thread does not panic")).sum()
+        let stalled_ms = self.threads.drain(..).flat_map(|thread| thread.join().expect("the thread does not panic"));
+        stalled_ms.collect::<HashSet<u128>>().len()
+    }
+}
+
+impl Drop for Stalls {
+    fn drop(&mut self) {
+        self.is_over.store(true, Ordering::Relaxed);
     }
 }
 

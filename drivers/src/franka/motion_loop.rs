@@ -3,7 +3,7 @@
 
 use super::limits::RobotLimits;
 use super::mailbox::{MotionCommand, MotionMailbox};
-use super::reference::{CommandFate, Reference, ReferenceTracker};
+use super::reference::{CommandFate, N_SUCCESS_WINDOW, Reference, ReferenceTracker};
 use super::request::{self, MotionResponse};
 use super::session::{Session, error_text};
 use super::state::NumberedState;
@@ -22,8 +22,6 @@ const MAX_AT_REST: u32 = 1000;
 const MAX_STATES_UNTIL_START: u32 = 1000;
 /// Number of states within which a robot reports why a motion ended.
 const MAX_STATES_UNTIL_RESPONSE: u32 = 100;
-/// The robot reports the success rate of its last 100 commands, so it is valid only after this many states.
-const N_SUCCESS_WINDOW: u64 = 100;
 
 /// Moves an arm in response to its states.
 #[derive(Debug)]
@@ -199,6 +197,7 @@ impl MotionLoop {
         if let CommandFate::Missed(n) = fate {
             mailbox_state.statistics.n_missed += n;
         }
+        // Earlier success rates contain commands from before the motion.
         if active.n_cycles > N_SUCCESS_WINDOW {
             mailbox_state.statistics.count_robot_success(stamped.numbered.state.control_command_success_rate);
         }

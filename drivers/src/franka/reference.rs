@@ -11,14 +11,16 @@ const STEP_SECS: f64 = rate_limiting::DELTA_T;
 const POSITION_TOLERANCE_RAD: f64 = 4e-7;
 /// Maximum velocity difference between our reference and the robot's, for velocities up to 8 rad/s.
 const VELOCITY_TOLERANCE_RAD_S: f64 = 1e-6;
-/// Maximum number of steps by which a reported reference or success rate may be behind: `franka-sim` reports what its
-/// joint thread has processed.
+/// Maximum number of steps by which a reported reference may be behind: `franka-sim` reports what its joint thread
+/// has processed.
 const MAX_BEHIND: f64 = 3.0;
 /// Number of consecutive missing commands after which the robot stops. Source: FCI documentation, "Real-time control
 /// commands".
 const MAX_MISSED: u64 = 20;
-/// Number of commands from which the robot computes its success rate.
-const SUCCESS_WINDOW: f64 = 100.0;
+/// Number of most recent commands over which the robot computes its success rate.
+pub(super) const N_SUCCESS_WINDOW: u64 = 100;
+/// Number of missed commands that a success rate may not contain yet.
+const MAX_UNREPORTED: f64 = 3.0;
 
 /// Commanded joint positions, rad, with velocities and accelerations as differences per millisecond, as the robot
 /// computes them.
@@ -44,47 +46,49 @@ pub(super) enum CommandFate {
 #[derive(Debug)]
 pub(super) struct ReferenceTracker {
     reference: Reference,
-    /// The reference if the robot has received all commands since it last certainly followed one.
+    /// The reference if the robot received all commands that were sent since it last followed one.
     if_all_received: Reference,
-    /// Number of consecutive commands that the robot seems to have missed.
-    n_missed: u64,
+    /// Number of those commands. The robot seems to have missed them.
+    n_doubtful: u64,
 }
 
 impl ReferenceTracker {
     pub(super) fn new(reference: Reference) -> Self {
-        Self { reference, if_all_received: reference, n_missed: 0 }
+        Self { reference, if_all_received: reference, n_doubtful: 0 }
     }
 
     pub(super) fn reference(&self) -> &Reference {
         &self.reference
     }
 
-    /// Advances by `n_states`, of which the first was answered with `sent`. See [`Reference::advance`].
+    /// Advances over `n_states` new states. `sent` is the answer to the state before them.
     ///
-    /// A command that is wrongly taken for missed displaces our reference by its small effect. The next command then has
-    /// the same effect on the robot as a missing one, and so on: the robot would accelerate for as long as the jerk stays
-    /// the same. The success rate that the robot reports shows this mistake: it bounds the number of missed commands.
+    /// If a received command is mistaken for a missed one, our reference is off by the effect of that command. The next
+    /// command is then exactly where the robot would have extrapolated to, so it looks missed as well. This repeats, and
+    /// the robot keeps its acceleration for as long as the commanded jerk is constant. The reported success rate reveals
+    /// the mistake, because it limits how many commands can have been missed. In the first [`N_SUCCESS_WINDOW`] states of
+    /// a motion, a rate that starts at 0 reveals it later.
     pub(super) fn advance(&mut self, sent: Option<[f64; N_JOINTS]>, n_states: u64, state: &RobotState) -> CommandFate {
         let (reference, fate) = self.reference.advance(sent, n_states, state);
         self.reference = reference;
-        match fate {
-            CommandFate::Missed(n) => {
-                self.if_all_received = self.if_all_received.after(sent, n_states);
-                self.n_missed += n;
-            }
-            _ => (self.if_all_received, self.n_missed) = (reference, 0),
-        }
-        if self.n_missed as f64 <= n_lost(state) + MAX_BEHIND {
+        if fate != CommandFate::Missed(n_states) {
+            (self.if_all_received, self.n_doubtful) = (reference, 0);
             return fate;
         }
-        (self.reference, self.n_missed) = (self.if_all_received, 0);
+        self.if_all_received = self.if_all_received.after(sent, n_states);
+        self.n_doubtful += u64::from(sent.is_some());
+        let is_contradicted = self.n_doubtful as f64 > n_reported_missed(state) + MAX_UNREPORTED;
+        if !is_contradicted || !self.if_all_received.is_near(state) {
+            return fate;
+        }
+        (self.reference, self.n_doubtful) = (self.if_all_received, 0);
         CommandFate::Unknown
     }
 }
 
-/// Number of commands that the robot has missed among the last ones, according to its success rate.
-fn n_lost(state: &RobotState) -> f64 {
-    ((1.0 - state.control_command_success_rate) * SUCCESS_WINDOW).round()
+/// Number of commands in the success window that the robot missed, according to its success rate. NaN if it reports NaN.
+fn n_reported_missed(state: &RobotState) -> f64 {
+    ((1.0 - state.control_command_success_rate.clamp(0.0, 1.0)) * N_SUCCESS_WINDOW as f64).round()
 }
 
 impl Reference {
@@ -116,14 +120,14 @@ impl Reference {
         }
     }
 
-    /// The reference after `n` states, of which the first was answered with `sent`.
+    /// The reference after `n` new states, if the robot received `sent` and nothing after it.
     fn after(&self, sent: Option<[f64; N_JOINTS]>, n: u64) -> Self {
         let first = sent.map_or_else(|| self.missed(), |position_rad| self.sent(position_rad));
         (1..n).fold(first, |reference, _| reference.missed())
     }
 
-    /// Advances the reference by `n_states`, of which the first was answered with `sent`, and returns the outcome of
-    /// that command.
+    /// Advances the reference over `n_states` new states, and returns the outcome of `sent`, the answer to the state
+    /// before them.
     ///
     /// Keeps our own numbers if they match the robot's up to rounding, because differences of rounded numbers are
     /// inaccurate. If the effect of a missing command is within that rounding, the reported velocities decide, because
@@ -139,17 +143,13 @@ impl Reference {
         if n_states > MAX_MISSED {
             return (reported, CommandFate::Unknown);
         }
-        let is_near = |reference: &Self| {
-            let pairs = reference.position_rad.into_iter().zip(reported.position_rad);
-            pairs.into_iter().all(|(own, robot)| (own - robot).abs() <= POSITION_TOLERANCE_RAD)
-        };
         let matches_rates = |reference: &Self| {
             let pairs = reference.velocity_rad_s.into_iter().zip(reported.velocity_rad_s);
             pairs.into_iter().all(|(own, robot)| (own - robot).abs() <= VELOCITY_TOLERANCE_RAD_S)
         };
         let n_after = n_states - 1;
         let if_sent_received = sent.map(|position_rad| self.after(Some(position_rad), n_states));
-        let if_received = if_sent_received.filter(is_near);
+        let if_received = if_sent_received.filter(|reference| reference.is_near(state));
         let if_missed = self.after(None, n_states);
         match if_received {
             Some(if_received) if !matches_rates(&if_received) && matches_rates(&if_missed) && !matches_rates(self) => {
@@ -158,13 +158,19 @@ impl Reference {
             Some(if_received) if n_after == 0 => (if_received, CommandFate::Followed),
             Some(if_received) => (if_received, CommandFate::Missed(n_after)),
             None => match if_sent_received {
-                _ if is_near(&if_missed) => (if_missed, CommandFate::Missed(n_states)),
+                _ if if_missed.is_near(state) => (if_missed, CommandFate::Missed(n_states)),
                 Some(if_received) if n_after == 0 && if_received.is_shortly_after(&reported) => {
                     (if_received, CommandFate::Followed)
                 }
                 _ => (reported, CommandFate::Unknown),
             },
         }
+    }
+
+    /// Whether all positions match the reported ones up to rounding.
+    fn is_near(&self, state: &RobotState) -> bool {
+        let joints = self.position_rad.into_iter().zip(state.q_d);
+        joints.into_iter().all(|(own, robot)| (own - robot).abs() <= POSITION_TOLERANCE_RAD)
     }
 
     /// Whether each joint may have been at the reported position a few steps ago.
@@ -190,6 +196,13 @@ impl Reference {
 mod tests {
     use super::*;
 
+    impl Reference {
+        /// The position a millisecond later with a constant jerk.
+        fn next_position(&self, jerk_rad_s3: f64) -> [f64; N_JOINTS] {
+            self.missed().position_rad.map(|position| position + jerk_rad_s3 * STEP_SECS.powi(3) / 6.0)
+        }
+    }
+
     /// State of an FCI 10 robot with this reference, rounded to floats.
     #[expect(clippy::cast_possible_truncation, reason = "FCI 10 sends floats")]
     fn state(reference: &Reference) -> RobotState {
@@ -198,6 +211,11 @@ mod tests {
         state.q_d = rounded(reference.position_rad);
         state.dq_d = rounded(reference.velocity_rad_s);
         state.ddq_d = rounded(reference.acceleration_rad_s2);
+        state
+    }
+
+    fn with_rate(mut state: RobotState, rate: f64) -> RobotState {
+        state.control_command_success_rate = rate;
         state
     }
 
@@ -243,28 +261,42 @@ mod tests {
     }
 
     #[test]
-    fn wrongly_missed_command_does_not_displace_reference_for_long() {
+    fn command_mistaken_for_missed_displaces_reference_only_briefly() {
         const JERK_RAD_S3: f64 = -10.0;
-        const MAX_DISPLACED: usize = 8; // 3 reported losses, and as many steps as the report may be behind.
-        let next = |reference: &Reference| {
-            reference.missed().position_rad.map(|position| position + JERK_RAD_S3 * STEP_SECS.powi(3) / 6.0)
-        };
-        // The robot has received the last command, but our reference does not contain it.
+        const RATE: f64 = 0.97;
+        let next = |reference: &Reference| reference.next_position(JERK_RAD_S3);
+        // The robot followed the last command, but our reference counts it as missed.
         let (earlier, _) = moving(JERK_RAD_S3);
         let mut robot = earlier.sent(next(&earlier));
         let mut tracker = ReferenceTracker::new(earlier.missed());
-        let mut n_displaced = 0;
-        for _ in 0..60 {
+        let fates: Vec<CommandFate> = std::iter::repeat_with(|| {
             let sent = next(tracker.reference());
             robot = robot.sent(sent);
-            let mut reported = state(&robot);
-            reported.control_command_success_rate = 0.97;
-            n_displaced += usize::from(tracker.advance(Some(sent), 1, &reported) != CommandFate::Followed);
-        }
-        assert!((1..=MAX_DISPLACED).contains(&n_displaced), "{n_displaced} commands");
+            tracker.advance(Some(sent), 1, &with_rate(state(&robot), RATE))
+        })
+        .take(60)
+        .collect();
+        // Three are reported as missed, and three may not be reported yet.
+        let n_displaced = fates.iter().take_while(|fate| **fate != CommandFate::Followed).count();
+        assert_eq!(n_displaced, 7, "{fates:?}");
+        assert!(fates[n_displaced..].iter().all(|fate| *fate == CommandFate::Followed), "{fates:?}");
         let expected = 0.7 + (60 - n_displaced) as f64 * JERK_RAD_S3 * STEP_SECS / 6.0;
         assert!((robot.acceleration_rad_s2[0] - expected).abs() < 5e-3, "{robot:?}, expected {expected}");
         assert!((robot.position_rad[0] - tracker.reference().position_rad[0]).abs() < 1e-12, "{tracker:?}");
+    }
+
+    #[test]
+    fn missed_commands_stay_missed() {
+        let (start, _) = moving(0.0);
+        for (n_states, rate) in [(1, 0.9), (1, f64::NAN), (6, 0.94), (6, 1.0)] {
+            let (mut robot, mut tracker) = (start, ReferenceTracker::new(start));
+            for _ in 0..10 {
+                robot = robot.after(None, n_states);
+                let sent = tracker.reference().next_position(600.0);
+                let fate = tracker.advance(Some(sent), n_states, &with_rate(state(&robot), rate));
+                assert_eq!((fate, *tracker.reference()), (CommandFate::Missed(n_states), robot), "{n_states}, {rate}");
+            }
+        }
     }
 
     #[test]

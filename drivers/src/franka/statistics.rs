@@ -83,7 +83,8 @@ pub struct MotionStatistics {
     pub n_stale: u64,
     /// States that never arrived, or arrived together with a newer one.
     pub n_lost: u64,
-    /// Commands that the robot missed, according to its reported reference. With a small jerk this is not detectable.
+    /// Commands that the robot missed, according to its reported reference. With a small jerk this is not detectable,
+    /// or a few received commands may count as missed.
     pub n_missed: u64,
     /// Commands that were changed to stay within the limits of the robot.
     pub n_limited: u64,
