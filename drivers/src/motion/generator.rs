@@ -160,6 +160,24 @@ impl TrajectoryGenerator {
         }
     }
 
+    /// Describes why no trajectory was found. `rsruckig` names only the number of the joint and repeats the input.
+    fn describe(&self, error: &RuckigError) -> String {
+        let message = error.to_string();
+        let number =
+            message.split("dof: ").nth(1).and_then(|rest| rest.split_whitespace().next()?.parse::<usize>().ok());
+        let Some((ix, joint)) = number.and_then(|ix| Some((ix, self.limits.get(ix)?))) else {
+            return format!("found no trajectory to the target: {}", message.lines().next().unwrap_or_default());
+        };
+        let ([lower, upper], input) = (joint.position, &self.input);
+        let [position, velocity, target] =
+            [&input.current_position, &input.current_velocity, &input.target_position].map(|joints| joints[ix]);
+        format!(
+            "found no trajectory to the target: joint {} is at {position:.4} with a velocity of {velocity:.4} per second; it must \
+             reach {target:.4} and stay within {lower:.4} to {upper:.4}",
+            ix + 1
+        )
+    }
+
     /// Returns the setpoint of the next cycle.
     pub fn step(&mut self) -> Result<Setpoint, String> {
         if !self.is_at_rest {
@@ -167,7 +185,7 @@ impl TrajectoryGenerator {
                 Err(error) => self
                     .update_with_less_jerk()
                     .or_else(|| self.update_with_overshoot())
-                    .ok_or_else(|| describe(&error))?,
+                    .ok_or_else(|| self.describe(&error))?,
                 Ok(result) => result,
             };
             self.output.pass_to_input(&mut self.input);
@@ -200,15 +218,6 @@ fn check(position: &[f64], n: usize) -> Result<(), String> {
 
 fn data_array(values: impl Iterator<Item = f64>) -> DataArrayOrVec<f64, 0> {
     DataArrayOrVec::Heap(values.collect())
-}
-
-fn describe(error: &RuckigError) -> String {
-    // The rest of the message repeats the input.
-    let message = error.to_string();
-    format!(
-        "found no trajectory to the target: {}",
-        message.lines().next().unwrap_or_default().trim_end_matches("input: ").trim()
-    )
 }
 
 #[cfg(test)]
@@ -337,7 +346,11 @@ mod tests {
         assert!((trajectory[trajectory.len() - 1].position[0] - 1.0).abs() < 1e-9);
         assert!(trajectory.iter().all(|setpoint| setpoint.acceleration[0].abs() < 2.0001));
         generator.resume(&setpoint_at(0.999)).unwrap();
-        assert!(generator.step().unwrap_err().contains("no trajectory"), "it would overshoot too far");
+        let error = generator.step().unwrap_err();
+        assert!(
+            error.contains("no trajectory") && error.contains("joint 1 is at 0.9990 with a velocity of 0.4000"),
+            "it would overshoot too far: {error}"
+        );
         generator.stop();
         while !generator.is_at_rest() {
             generator.step().unwrap();
