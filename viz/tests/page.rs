@@ -575,11 +575,15 @@ fn label(browser: &mut Browser) -> String {
     label.as_str().unwrap_or_default().to_owned()
 }
 
-/// Saves screenshots for both window sizes.
+/// Saves screenshots for both window sizes. Open panels must be below the toolbar, which has two rows on a phone.
 fn save_screenshot(browser: &mut Browser, name: &str) {
     for (window, size_px) in [("phone", PHONE_PX), ("desktop", DESKTOP_PX)] {
         browser.resize(size_px);
         std::thread::sleep(Duration::from_millis(400));
+        let expression = "(() => { const { bottom } = document.getElementById('toolbar').getBoundingClientRect();
+            return [...document.querySelectorAll('.panel:not([hidden])')].every(
+                (panel) => panel.getBoundingClientRect().top > bottom); })()";
+        assert_eq!(browser.evaluate(expression), true, "the toolbar overlaps a panel: {name}, {window}");
         let file = PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join(format!("page-{name}-{window}.png"));
         std::fs::write(file, browser.screenshot()).expect("written");
     }
