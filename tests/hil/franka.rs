@@ -150,6 +150,9 @@ fn follow_for_ten_thousand_cycles(name: &str, open: impl Fn() -> MovableFrankaAr
         }
         assert!(result.is_ok() || stalled_frac > MAX_STALLED_FRAC_OF_REFLEX, "{outcome}");
         assert!(attempt < MAX_ATTEMPTS, "{outcome}");
+        if result.is_err() {
+            arm.recover().expect("the arm recovers");
+        }
     }
 }
 
