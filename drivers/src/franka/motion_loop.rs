@@ -197,7 +197,7 @@ impl MotionLoop {
         if let CommandFate::Missed(n) = fate {
             mailbox_state.statistics.n_missed += n;
         }
-        // Earlier success rates contain commands from before the motion.
+        // Before, the window of the success rate is not full.
         if active.n_cycles > N_SUCCESS_WINDOW {
             mailbox_state.statistics.count_robot_success(stamped.numbered.state.control_command_success_rate);
         }

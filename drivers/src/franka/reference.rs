@@ -120,7 +120,7 @@ impl Reference {
         }
     }
 
-    /// The reference after `n` new states, if the robot received `sent` and nothing after it.
+    /// The reference after `n` new states, if the robot received the command `sent` (if any) and nothing after it.
     fn after(&self, sent: Option<[f64; N_JOINTS]>, n: u64) -> Self {
         let first = sent.map_or_else(|| self.missed(), |position_rad| self.sent(position_rad));
         (1..n).fold(first, |reference, _| reference.missed())
