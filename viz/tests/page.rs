@@ -26,6 +26,7 @@ const WINDOW_PX: [u32; 2] = [1280, 760];
 /// Sizes of the screenshots in `CARGO_TARGET_TMPDIR`.
 const DESKTOP_PX: [u32; 2] = [1280, 800];
 const PHONE_PX: [u32; 2] = [390, 844];
+const TURNED_PHONE_PX: [u32; 2] = [844, 390];
 /// The page shows a lost connection within this time.
 const MAX_LOSS_DISPLAY_MILLIS: f64 = 1000.0;
 /// Added to the render time of each picture. If pictures took less than 20 ms, the server would skip the coarse
@@ -575,19 +576,19 @@ fn label(browser: &mut Browser) -> String {
     label.as_str().unwrap_or_default().to_owned()
 }
 
-/// Whether the toolbar, which has two rows on a phone, covers no open panel.
+/// Whether every open panel is below the toolbar, which has several rows in narrow windows, and in the view.
 fn panels_are_below_toolbar(browser: &mut Browser) -> bool {
     let expression = "(() => {
-        const { bottom } = document.getElementById('toolbar').getBoundingClientRect();
-        return [...document.querySelectorAll('.panel:not([hidden])')]
-            .every((panel) => panel.getBoundingClientRect().top > bottom);
+        const bounds = (id) => document.getElementById(id).getBoundingClientRect();
+        return [...document.querySelectorAll('.panel:not([hidden])')].every(({ id }) =>
+            bounds(id).top > bounds('toolbar').bottom && bounds(id).bottom < bounds('view').bottom);
     })()";
     browser.evaluate(expression) == true
 }
 
-/// Checks the layout of both window sizes and saves screenshots.
+/// Checks the layout at every window size and saves screenshots.
 fn save_screenshot(browser: &mut Browser, name: &str) {
-    for (window, size_px) in [("phone", PHONE_PX), ("desktop", DESKTOP_PX)] {
+    for (window, size_px) in [("turned-phone", TURNED_PHONE_PX), ("phone", PHONE_PX), ("desktop", DESKTOP_PX)] {
         browser.resize(size_px);
         std::thread::sleep(Duration::from_millis(400));
         assert!(panels_are_below_toolbar(browser), "{name}, {window}");
