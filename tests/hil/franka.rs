@@ -4,22 +4,21 @@
 
 #![cfg(target_os = "linux")]
 
+#[path = "../common/stalls.rs"]
+mod stalls;
+
 use drivers::Arm;
 use drivers::franka::emulated::{EmulatedRobot, JointSimulator, Joints, Limits, RobotConfig};
 use drivers::franka::{ArmConfig, ContactConfig, FciVersion, FrankaArm, MotionStatistics, MovableFrankaArm, N_JOINTS};
 use drivers::motion::{JointTarget, Motion, MotionConfig, MotionLimits, MovableArm, OnLoss};
-use franka::realtime::{pin_current_thread_to_cpu, set_current_thread_scheduler_priority};
 use kinematics::{Chain, Transform};
 use parking_lot::Mutex;
-use std::collections::HashSet;
+use stalls::Stalls;
 use std::fs;
 use std::io::Write;
 use std::net::{Ipv4Addr, SocketAddr, TcpListener};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
-use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 /// If set to `demand`, the tests fail instead of being skipped on a machine that cannot run them. `.ci/run` sets it.
@@ -138,7 +137,7 @@ fn follow_for_ten_thousand_cycles(name: &str, open: impl Fn() -> MovableFrankaAr
     for attempt in 1..=MAX_ATTEMPTS {
         let mut arm = open();
         let rest = arm.read(TEST_TIMEOUT).expect("the arm reports its joints").position;
-        let stalls = Stalls::start();
+        let (stalls, began) = (Stalls::start(), Instant::now());
         let mut directions = [-1.0, 0.0, 1.0, 0.0].into_iter().cycle();
         while arm.motion_statistics().n_answered < 10_000 {
             let by_rad = BY_RAD * directions.next().expect("the iterator is infinite");
@@ -163,7 +162,7 @@ fn follow_for_ten_thousand_cycles(name: &str, open: impl Fn() -> MovableFrankaAr
             assert!(off < NEAR_RAD, "{name}: {off} rad from its target");
         }
         let statistics = arm.motion_statistics();
-        let stalled_ms = stalls.stop();
+        let stalled_ms = stalls.stop().between(began, Instant::now()).as_millis();
         let outcome = format!("{name}: {statistics}; stalled for {stalled_ms} ms");
         report(&format!("our driver moves {outcome}\n"));
         let stalled_frac = stalled_ms as f64 / (statistics.n_cycles + statistics.n_lost) as f64;
@@ -178,56 +177,6 @@ fn follow_for_ten_thousand_cycles(name: &str, open: impl Fn() -> MovableFrankaAr
 fn is_in_time(statistics: &MotionStatistics, stalled_frac: f64) -> bool {
     let [reported, _] = statistics.robot_success_frac().expect("the arm has moved");
     statistics.n_motions > 0 && statistics.success_frac().min(reported) > 0.99 - stalled_frac
-}
-
-/// Measures when a processor could not run even a thread of high priority, for example because the host ran another
-/// virtual machine. Without real-time priority, the load of other programs and of this one counts, too.
-struct Stalls {
-    is_over: Arc<AtomicBool>,
-    threads: Vec<JoinHandle<Vec<u128>>>,
-}
-
-impl Stalls {
-    /// Starts one thread per processor, which sleeps for 1 ms at a time and records by how many milliseconds it wakes up
-    /// late.
-    fn start() -> Self {
-        /// Higher than the priority of the driver and the emulated robot, so that their computing time does not count as
-        /// a stall.
-        const PRIORITY: i32 = 90;
-        let is_over = Arc::new(AtomicBool::new(false));
-        let start = Instant::now();
-        let start_on = |cpu| {
-            let is_over = Arc::clone(&is_over);
-            std::thread::spawn(move || {
-                // If this is denied, the thread measures less accurately.
-                let _ = pin_current_thread_to_cpu(cpu).and_then(|()| set_current_thread_scheduler_priority(PRIORITY));
-                let (mut stalled_ms, mut last) = (Vec::new(), start.elapsed());
-                while !is_over.load(Ordering::Relaxed) {
-                    std::thread::sleep(Duration::from_millis(1));
-                    let now = start.elapsed();
-                    let n_late = (((now - last).as_micros() + 500) / 1000).saturating_sub(1);
-                    stalled_ms.extend(now.as_millis() - n_late..now.as_millis());
-                    last = now;
-                }
-                stalled_ms
-            })
-        };
-        let n_cpus = std::thread::available_parallelism().expect("the number of processors is known").get();
-        Self { threads: (0..n_cpus).map(start_on).collect(), is_over }
-    }
-
-    /// Stops the threads, and returns for how many milliseconds at least one processor was stalled.
-    fn stop(mut self) -> usize {
-        self.is_over.store(true, Ordering::Relaxed);
-        let stalled_ms = self.threads.drain(..).flat_map(|thread| thread.join().expect("the thread does not panic"));
-        stalled_ms.collect::<HashSet<u128>>().len()
-    }
-}
-
-impl Drop for Stalls {
-    fn drop(&mut self) {
-        self.is_over.store(true, Ordering::Relaxed);
-    }
 }
 
 /// Joint positions after the arm has come to rest. Skips older states in the queue.
