@@ -5,6 +5,7 @@
 mod analytic_scene;
 #[expect(dead_code, reason = "another test measures tasks")]
 mod browser;
+mod moved_picture;
 mod proxy;
 mod request_thread;
 
@@ -50,6 +51,9 @@ fn is_accent([red, green, blue]: [u8; 3]) -> bool {
     green >= red.saturating_add(30) && blue >= red.saturating_add(18)
 }
 
+/// Color of the view where nothing is drawn.
+const BACKGROUND: [u8; 3] = [11, 14, 19];
+
 /// A request and its model.
 type ReceivedRequest = (RenderRequest, Option<String>);
 
@@ -58,6 +62,8 @@ struct RenderThread {
     received_requests: Arc<Mutex<Vec<ReceivedRequest>>>,
     /// Added to the render time of each picture.
     drawing_millis: Arc<AtomicU64>,
+    /// Whether pictures wait.
+    is_paused: Arc<AtomicBool>,
     _thread: RequestThread,
 }
 
@@ -65,15 +71,19 @@ impl RenderThread {
     fn start(hub: Hub) -> Self {
         let received_requests: Arc<Mutex<Vec<ReceivedRequest>>> = Arc::default();
         let drawing_millis = Arc::new(AtomicU64::new(DRAWING_MILLIS));
-        let (received, drawing) = (Arc::clone(&received_requests), Arc::clone(&drawing_millis));
+        let is_paused: Arc<AtomicBool> = Arc::default();
+        let (received, drawing, paused) = (received_requests.clone(), drawing_millis.clone(), is_paused.clone());
         let thread = RequestThread::start(hub, move |pending| {
             let order = (pending.request.clone(), pending.method().map(str::to_owned));
             received.lock().expect("no thread panicked while holding the lock").push(order);
             let picture = draw(&pending.request);
             std::thread::sleep(Duration::from_millis(drawing.load(Ordering::Relaxed)));
+            while paused.load(Ordering::Relaxed) {
+                std::thread::sleep(Duration::from_millis(10));
+            }
             pending.deliver(picture);
         });
-        Self { received_requests, drawing_millis, _thread: thread }
+        Self { received_requests, drawing_millis, is_paused, _thread: thread }
     }
 
     /// The requests of the main view. Panoramas are requested for its surroundings.
@@ -210,13 +220,8 @@ fn page_renders_scene_and_overlays_correctly() {
     let turned = check_drag(&mut browser, &render_thread, &full);
     check_picture(&mut browser, &turned);
     std::fs::write(scratch.join("page-dragged.png"), browser.screenshot()).expect("written");
-    browser.click("reset-view");
-    wait_for(&mut browser, "the first view", |browser| {
-        let last = render_thread.requests().last().expect("drawn").clone();
-        let motion = full.world_from_camera.inverse() * last.world_from_camera;
-        let is_full = last.size_px == full.size_px && browser.text("picture-text").contains("100 %");
-        is_full && motion.translation.vector.norm() < 1e-6
-    });
+    reset_view(&mut browser, &render_thread, &full);
+    moved_picture::check(&mut browser, &render_thread, &full);
     check_distance(&mut browser, &full);
     check_images(&mut browser);
     check_settings(&mut browser, &render_thread, &full);
@@ -227,6 +232,17 @@ fn page_renders_scene_and_overlays_correctly() {
     drop(browser);
     drop(render_thread);
     std::fs::remove_dir_all(&profile).expect("the browser has left its profile");
+}
+
+/// Returns to the first view, and waits for its full picture.
+fn reset_view(browser: &mut Browser, render_thread: &RenderThread, full: &RenderRequest) {
+    browser.click("reset-view");
+    wait_for(browser, "the first view", |browser| {
+        let last = render_thread.requests().last().expect("drawn").clone();
+        let motion = full.world_from_camera.inverse() * last.world_from_camera;
+        let is_full = last.size_px == full.size_px && browser.text("picture-text").contains("100 %");
+        is_full && motion.translation.vector.norm() < 1e-6
+    });
 }
 
 /// Clicking another model's button requests its pictures and shows its values.
@@ -394,7 +410,7 @@ fn check_settings(browser: &mut Browser, render_thread: &RenderThread, before: &
     set(browser, "opacity", "0");
     let shot = canvas_shot(browser);
     let (x, y) = pixel_of(before, Point3::new(0.1, 0.1, 0.0));
-    assert_eq!(pixel(&shot, x, y), [11, 14, 19], "the background");
+    assert_eq!(pixel(&shot, x, y), BACKGROUND);
     set(browser, "opacity", "100");
     browser.click("toggle-grid");
     browser.click("toggle-settings");

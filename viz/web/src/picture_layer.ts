@@ -44,11 +44,34 @@ const FRAGMENT = /* glsl */ `${TINT}
   uniform vec2 principalPx;
   uniform mat4 worldFromPicture;
   varying vec3 pointInPicture;
+
+  float depthAt(vec2 uv) {
+    float depth = texture2D(depthMap, uv).r;
+    return depth > 0.0 ? depth : emptyDepth;
+  }
+
+  /** The smaller depth difference to the two neighbors along an axis: the slope, also next to a discontinuity. */
+  float slope(vec2 uv, float depth, vec2 axis) {
+    vec2 stepUv = axis / vec2(textureSize(depthMap, 0));
+    return min(abs(depthAt(uv - stepUv) - depth), abs(depthAt(uv + stepUv) - depth));
+  }
+
+  /** Largest difference between the depth of the grid and that of the picture, meters. */
+  float tolerance(vec2 uv, float depth) {
+    float largest = 0.08 * min(depth, pointInPicture.z);
+    vec3 normal = normalize(cross(dFdx(pointInPicture), dFdy(pointInPicture)));
+    if (abs(dot(normal, normalize(pointInPicture))) > 0.25) return largest;
+    // The triangle is almost parallel to the rays of the picture. Either it spans a discontinuity, or it belongs to a
+    // surface seen at a grazing angle, whose depth changes within a pixel.
+    float stepPx = sizePx.x / float(textureSize(depthMap, 0).x);
+    float slopes = slope(uv, depth, vec2(1.0, 0.0)) + slope(uv, depth, vec2(0.0, 1.0));
+    return min(largest, min(0.01 * stepPx * depth, 0.005 * depth + 1.5 * slopes));
+  }
+
   void main() {
     vec2 uv = (focalPx * pointInPicture.xy / pointInPicture.z + principalPx) / sizePx;
-    float depth = texture2D(depthMap, uv).r;
-    if (!(depth > 0.0)) depth = emptyDepth;
-    if (isMoved && abs(pointInPicture.z - depth) > 0.08 * min(depth, pointInPicture.z)) discard;
+    float depth = depthAt(uv);
+    if (isMoved && abs(pointInPicture.z - depth) > tolerance(uv, depth)) discard;
     vec3 pointInWorld = (worldFromPicture * vec4(pointInPicture * (depth / pointInPicture.z), 1.0)).xyz;
     gl_FragColor = vec4(tinted(texture2D(colorMap, uv).rgb, pointInWorld), opacity);
   }`;
