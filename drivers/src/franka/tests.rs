@@ -1,11 +1,15 @@
 //! Tests over loopback sockets: our driver, and franka-rs as a client that moves, against emulated robots.
 
+#[path = "../../../tests/common/stalls.rs"]
+mod stalls;
+
 use super::emulated::{CommandedJoints, EmulatedRobot, JointSimulator, Joints, Limits, RobotConfig};
 use super::{ArmConfig, FciVersion, FrankaArm, N_JOINTS};
 use crate::{Arm, Error};
 use franka::{ControllerMode, FrankaError, JointPositions, MoveStatus, RealtimeConfig, Robot, RobotMode};
 use kinematics::random::Random;
 use kinematics::{Chain, Stamp, Transform};
+use stalls::Stalls;
 use std::io::{Read, Write};
 use std::net::{SocketAddr, TcpStream, UdpSocket};
 use std::sync::{Arc, Mutex};
@@ -70,8 +74,10 @@ pub(super) fn ideal_joints() -> JointSimulator {
 
 #[test]
 fn ten_thousand_states_are_received_in_both_versions() {
-    // Loopback loses nothing; a busy machine may fail to send or receive some states in time.
+    // Loopback loses nothing; a busy machine may fail to send or receive some states in time, and while a processor is
+    // stalled, states are lost.
     const MIN_FRAC: f64 = 0.99;
+    const MAX_STALLED_FRAC: f64 = 0.2;
     // Maximum delay of a stamp, from the wake-up latency of one thread.
     const MAX_LATE_SECS: f64 = 5e-3;
     for version in VERSIONS {
@@ -80,6 +86,7 @@ fn ten_thousand_states_are_received_in_both_versions() {
         assert_eq!(arm.version(), version);
         let mut last = None;
         let mut max_error: f64 = 0.0;
+        let (stalls, began) = (Stalls::start(), Instant::now());
         for ix in 0..10_000 {
             let state = arm.read(TEST_TIMEOUT).unwrap();
             assert!(last.is_none_or(|last| state.stamp > last));
@@ -92,8 +99,14 @@ fn ten_thousand_states_are_received_in_both_versions() {
             assert_eq!(state.effort, truth.torque_nm);
         }
         let statistics = arm.statistics();
+        let now = Instant::now();
+        let stalled = stalls.stop().between(began, now).as_secs_f64();
+        let stalled_frac = (stalled / (now - began).as_secs_f64()).min(MAX_STALLED_FRAC);
         eprintln!("{version:?}: {statistics}; positions at their stamps within {max_error:.1e} rad");
-        assert!(statistics.success_frac() > MIN_FRAC, "{version:?}: {statistics}");
+        assert!(
+            statistics.success_frac() > MIN_FRAC - stalled_frac,
+            "{version:?}: {statistics}; stalled for {stalled:.3} s"
+        );
         assert!(max_error < 0.4 * MAX_LATE_SECS, "{version:?}: {max_error} rad; {statistics}");
     }
 }
