@@ -69,6 +69,18 @@ fn check_local(browser: &mut Browser, thread: &ModelThread, model: &mut dyn Meth
     }
 }
 
+/// Takes the graphics from the page for a moment, as phones do with pages in the background.
+fn lose_graphics(browser: &mut Browser) {
+    let extension =
+        "window.graphics ??= document.getElementById('canvas').getContext('webgl2').getExtension('WEBGL_lose_context')";
+    browser.evaluate(&format!("({extension}).loseContext()"));
+    wait_for(browser, "the loss", |browser| {
+        browser.text("banner") == "The browser has stopped the graphics of this page"
+    });
+    browser.evaluate("graphics.restoreContext()");
+    wait_for(browser, "the return", |browser| browser.text("banner").is_empty());
+}
+
 /// Checks that the model is tinted by its observations, no matter where it is drawn. The left half was just observed, the
 /// right half long ago.
 fn check_tint(browser: &mut Browser, hub: &Hub, name: &str) {
@@ -147,6 +159,8 @@ fn local_drawing_equals_the_pictures_of_the_server() {
     browser.click("toggle-grid");
     browser.click("toggle-local");
     check_local(&mut browser, &thread, &mut reference_splats, ("splat", MIN_DB));
+    lose_graphics(&mut browser);
+    check_local(&mut browser, &thread, &mut reference_splats, ("splat-after-loss", MIN_DB));
 
     // The view moves without pictures from the server, which is asked only for depth when the view rests.
     let (before, n_color_requests) = (thread.last_request(), thread.n_color_requests());
@@ -168,6 +182,8 @@ fn local_drawing_equals_the_pictures_of_the_server() {
     wait_for(&mut browser, "the other model", |_| hub.chunk_period("tsdf").is_some());
     assert!(hub.chunk_period("splat").is_none() && !hub.has_model_chunks("splat"), "its memory is free");
     check_local(&mut browser, &thread, &mut reference_tsdf, ("tsdf", MIN_DB));
+    lose_graphics(&mut browser);
+    check_local(&mut browser, &thread, &mut reference_tsdf, ("tsdf-after-loss", MIN_DB));
     check_tint(&mut browser, &hub, "tsdf");
     browser.click("toggle-crop");
     wait_for(&mut browser, "the crop", |_| thread.last_request().crop.is_some());

@@ -10,6 +10,13 @@ export class Banner {
   private connectionText = "";
   private result: RunResult | null = null;
   private guidance: Guidance | null = null;
+  private graphics = "";
+
+  /** Says why nothing can be drawn; an empty text if it can. */
+  setGraphics(text: string): void {
+    this.graphics = text;
+    this.show();
+  }
 
   setConnection(state: ConnectionState, text: string): void {
     this.connection = state;
@@ -37,10 +44,13 @@ export class Banner {
     // Once a run has ended, a stopped server is expected.
     const { result, guidance, isFinished } = this;
     const hasProblem = isBroken && !isFinished;
-    const text = result ? runResultText(result) : capitalized(hasProblem ? this.connectionText : (guidance?.text ?? ""));
+    const text =
+      this.graphics ||
+      (result ? runResultText(result) : capitalized(hasProblem ? this.connectionText : (guidance?.text ?? "")));
     const banner = element("banner");
     if (banner.textContent !== text) banner.textContent = text; // Otherwise screen readers would repeat it.
-    banner.dataset.kind = isFinished ? "finished" : hasProblem || !guidance ? this.connection : "guidance";
+    const kind = isFinished ? "finished" : hasProblem || !guidance ? this.connection : "guidance";
+    banner.dataset.kind = this.graphics ? "graphics" : kind;
     element("view").classList.toggle("stale", hasProblem);
   }
 }

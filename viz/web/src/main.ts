@@ -38,11 +38,7 @@ const TINTS: readonly { id: string; key: string; quantity: Quantity }[] = [
 
 const readouts = new Readouts();
 const banner = new Banner();
-const view = new OrbitView(
-  element("canvas", HTMLCanvasElement),
-  () => scheduler.moved(),
-  () => connection.clock,
-);
+const view = openView();
 keepToken();
 window.addEventListener("hashchange", () => {
   if (keepToken()) location.reload(); // The server assigns the role when the page connects.
@@ -109,6 +105,28 @@ const surroundings = new Surroundings(
   () => view.forgetSurfaces(),
 );
 const settings = new ViewSettings(view, scheduler, sides[1]);
+
+function openView(): OrbitView {
+  const canvas = element("canvas", HTMLCanvasElement);
+  try {
+    const view = new OrbitView(canvas, () => scheduler.moved(), () => connection.clock);
+    // Phones take the graphics of pages in the background. These listeners are called after those of the renderer.
+    canvas.addEventListener("webglcontextlost", () => {
+      banner.setGraphics("The browser has stopped the graphics of this page");
+    });
+    canvas.addEventListener("webglcontextrestored", () => {
+      banner.setGraphics("");
+      view.restoreGraphics();
+    });
+    return view;
+  } catch (error) {
+    element("connection").textContent = "not connected";
+    banner.setGraphics(
+      "This browser cannot draw the scene, because it offers no WebGL 2: turn on hardware acceleration in its settings, or use a newer browser",
+    );
+    throw error;
+  }
+}
 
 function receiveText(message: TextMessage): void {
   switch (message.type) {

@@ -81,7 +81,7 @@ export class OrbitView {
     // Colors arrive as sRGB and are output unchanged.
     this.renderer.outputColorSpace = THREE.LinearSRGBColorSpace;
     THREE.ColorManagement.enabled = false;
-    this.renderer.setClearColor(new THREE.Color(...BACKGROUND));
+    this.restoreGraphics();
     this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
     this.camera.up.set(0, 0, 1);
     this.camera.position.set(1, -1, 1);
@@ -113,6 +113,12 @@ export class OrbitView {
       onMove();
     }).observe(canvas.parentElement!);
     this.fit();
+  }
+
+  /** Sets what the renderer forgets with the graphics context, and draws again. */
+  restoreGraphics(): void {
+    this.renderer.setClearColor(new THREE.Color(...BACKGROUND));
+    this.changed();
   }
 
   /** Adopts a scene; the camera moves to its initial view unless the user has moved it. */

@@ -73,7 +73,9 @@ const FRAGMENT = /* glsl */ `${TINT}
     float depth = depthAt(uv);
     if (isMoved && abs(pointInPicture.z - depth) > tolerance(uv, depth)) discard;
     vec3 pointInWorld = (worldFromPicture * vec4(pointInPicture * (depth / pointInPicture.z), 1.0)).xyz;
-    gl_FragColor = vec4(tinted(texture2D(colorMap, uv).rgb, pointInWorld), opacity);
+    vec3 color = texture2D(colorMap, uv).rgb;
+    bool isEmpty = !(texture2D(depthMap, uv).r > 0.0);
+    gl_FragColor = vec4(isEmpty ? color : tinted(color, pointInWorld), opacity);
   }`;
 
 /** A picture that has been received, and what becomes of it: whether it is shown. */
