@@ -24,6 +24,7 @@ mod motion_loop;
 mod motion_tests;
 mod movable;
 mod realtime;
+mod recent_cycles;
 mod reference;
 mod request;
 mod session;

@@ -3,6 +3,7 @@
 
 use super::limits::RobotLimits;
 use super::mailbox::{MotionCommand, MotionMailbox};
+use super::recent_cycles::RecentCycles;
 use super::reference::{CommandFate, N_SUCCESS_WINDOW, Reference, ReferenceTracker};
 use super::request::{self, MotionResponse};
 use super::session::{Session, error_text};
@@ -71,6 +72,7 @@ struct ActiveMotion {
     number: u64,
     /// The position sent in answer to the newest state.
     sent: Option<[f64; super::N_JOINTS]>,
+    recent: RecentCycles,
     n_cycles: u64,
     n_at_rest: u32,
     is_ending: bool,
@@ -99,7 +101,11 @@ impl MotionLoop {
             MotionState::Beginning { id, n_waited } => self.start_motion(id, n_waited, stamped),
             MotionState::ActiveMotion(active) if state.robot_mode != RobotMode::Move => {
                 self.mailbox.update(|mailbox_state| mailbox_state.accepts_commands = false);
-                MotionState::Ending { id: active.id, n_waited: 0, reason: cause(state) }
+                let reason = match state.robot_mode {
+                    RobotMode::Reflex => cause(state).map(|reason| self.explained(&reason, &active.recent)),
+                    _ => cause(state),
+                };
+                MotionState::Ending { id: active.id, n_waited: 0, reason }
             }
             MotionState::ActiveMotion(active) => self.run(active, stamped),
             MotionState::Ending { id, n_waited, reason } => self.conclude(id, n_waited, reason),
@@ -154,6 +160,7 @@ impl MotionLoop {
             tracker: ReferenceTracker::new(reference),
             number: numbered.number,
             sent: None,
+            recent: RecentCycles::new(),
             n_cycles: 0,
             n_at_rest: 0,
             is_ending: false,
@@ -178,6 +185,7 @@ impl MotionLoop {
         if stamped.is_fresh {
             self.send(&mut active, stamped, position_rad);
         }
+        active.recent.push(stamped.numbered, fate, active.tracker.reference(), active.sent);
         MotionState::ActiveMotion(active)
     }
 
@@ -194,9 +202,7 @@ impl MotionLoop {
         mailbox_state.statistics.n_cycles += 1;
         mailbox_state.statistics.n_lost += n_states.saturating_sub(1);
         mailbox_state.statistics.n_stale += u64::from(!stamped.is_fresh);
-        if let CommandFate::Missed(n) = fate {
-            mailbox_state.statistics.n_missed += n;
-        }
+        mailbox_state.statistics.n_missed += fate.n_missed();
         // Before, the window of the success rate is not full.
         if active.n_cycles > N_SUCCESS_WINDOW {
             mailbox_state.statistics.count_robot_success(stamped.numbered.state.control_command_success_rate);
@@ -253,6 +259,12 @@ impl MotionLoop {
             // This has the same effect as a lost datagram: the robot extrapolates.
             Err(error) => log::debug!("{}: a command could not be sent: {}", self.device, error_text(&error)),
         }
+    }
+
+    /// Adds to the reason of a stop what happened before it, and logs the last cycles.
+    fn explained(&self, reason: &str, recent: &RecentCycles) -> String {
+        log::debug!("{}: the last cycles before the stop: {}", self.device, recent.table());
+        format!("{reason}; {}", recent.summary())
     }
 
     /// Makes the robot brake.

@@ -239,6 +239,7 @@ fn contact_triggers_reflex_until_recovery() {
         *contact_nm.lock().unwrap() = 16.0;
         let reason = move_until_stopped(&mut arm, &start);
         assert!(reason.contains("reflex") && reason.contains("joint_reflex"), "{reason}");
+        assert!(reason.contains("; in the last 60 cycles, the robot missed "), "{reason}");
         let open_error = arm.command(&start).unwrap_err().to_string();
         assert!(open_error.contains("recovered") && open_error.contains("joint_reflex"), "{open_error}");
         *contact_nm.lock().unwrap() = 0.0;

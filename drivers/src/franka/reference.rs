@@ -42,6 +42,15 @@ pub(super) enum CommandFate {
     Unknown,
 }
 
+impl CommandFate {
+    pub(super) fn n_missed(self) -> u64 {
+        match self {
+            Self::Missed(n) => n,
+            Self::Followed | Self::Unknown => 0,
+        }
+    }
+}
+
 /// Tracks the robot's reference during one motion.
 #[derive(Debug)]
 pub(super) struct ReferenceTracker {
