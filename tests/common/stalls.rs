@@ -23,7 +23,7 @@ impl Stalls {
         let start_on = |cpu| {
             let is_over = Arc::clone(&is_over);
             std::thread::spawn(move || {
-                run_first_on(cpu);
+                pin_with_high_priority(cpu);
                 let (mut stalled_ms, mut last) = (Vec::new(), start.elapsed());
                 while !is_over.load(Ordering::Relaxed) {
                     std::thread::sleep(Duration::from_millis(1));
@@ -39,7 +39,7 @@ impl Stalls {
         Self { start, threads: (0..n_cpus).map(start_on).collect(), is_over }
     }
 
-    /// Stops the threads, and returns when at least one processor was stalled.
+    /// Stops the threads, and returns the times at which at least one processor was stalled.
     pub(crate) fn stop(mut self) -> StalledTimes {
         self.is_over.store(true, Ordering::Relaxed);
         let threads = self.threads.drain(..);
@@ -49,7 +49,7 @@ impl Stalls {
 }
 
 /// Gives this thread a high priority on one processor. If that is denied, it measures less accurately.
-fn run_first_on(cpu: usize) {
+fn pin_with_high_priority(cpu: usize) {
     /// Higher than the priority of the Franka driver and the emulated robot, so that their computing time does not count
     /// as a stall.
     #[cfg(target_os = "linux")]
@@ -67,18 +67,51 @@ impl Drop for Stalls {
     }
 }
 
-/// When at least one processor was stalled.
+/// The times at which at least one processor was stalled.
 pub(crate) struct StalledTimes {
     start: Instant,
     /// Since `start`.
     stalled_ms: BTreeSet<u128>,
 }
 
+#[allow(dead_code, reason = "each test needs one of the methods")]
 impl StalledTimes {
-    /// For how long a processor was stalled between two times.
-    pub(crate) fn between(&self, from: Instant, to: Instant) -> Duration {
-        let ms = |time: Instant| time.duration_since(self.start).as_millis();
-        let n_ms = self.stalled_ms.range(ms(from)..=ms(to)).count();
-        Duration::from_millis(n_ms.try_into().expect("shorter than a test"))
+    /// The share of the time between two times for which a processor was stalled. It is at most 20 %, so that a stalled
+    /// machine does not excuse everything.
+    pub(crate) fn frac(&self, from: Instant, to: Instant) -> f64 {
+        const MAX_FRAC: f64 = 0.2;
+        let n_ms = self.stalled_ms.range(self.range_ms(from, to)).count();
+        (n_ms as f64 * 1e-3 / (to - from).as_secs_f64()).min(MAX_FRAC)
     }
+
+    /// The time between two times without long stalls. Shorter ones also result from ordinary load, and more than a
+    /// second is not excused.
+    pub(crate) fn unstalled(&self, from: Instant, to: Instant) -> Duration {
+        const MIN_LONG_MS: usize = 20;
+        const MAX_EXCUSED: Duration = Duration::from_secs(1);
+        let stalled_ms: Vec<u128> = self.stalled_ms.range(self.range_ms(from, to)).copied().collect();
+        let stalls = stalled_ms.chunk_by(|before, after| after - before == 1);
+        let n_ms: usize = stalls.map(<[u128]>::len).filter(|n_ms| *n_ms >= MIN_LONG_MS).sum();
+        let stalled = Duration::from_millis(n_ms.try_into().expect("shorter than a test"));
+        (to - from).saturating_sub(stalled.min(MAX_EXCUSED))
+    }
+
+    fn range_ms(&self, from: Instant, to: Instant) -> std::ops::Range<u128> {
+        let ms = |time: Instant| time.duration_since(self.start).as_millis();
+        ms(from)..ms(to)
+    }
+}
+
+#[test]
+fn only_stalls_within_the_time_count() {
+    let start = Instant::now();
+    let at = |ms| start + Duration::from_millis(ms);
+    let stalled_ms = (100..150).chain(200..210).chain(5000..9000).collect();
+    let stalled = StalledTimes { start, stalled_ms };
+    let close = |frac: f64, expected: f64| (frac - expected).abs() < 1e-9;
+    assert!(close(stalled.frac(at(0), at(1000)), 0.06) && close(stalled.frac(at(300), at(500)), 0.0));
+    assert!(close(stalled.frac(at(4000), at(9000)), 0.2), "at most");
+    assert_eq!(stalled.unstalled(at(0), at(1000)), Duration::from_millis(950), "without the short stall");
+    assert_eq!(stalled.unstalled(at(120), at(400)), Duration::from_millis(250), "without the earlier part");
+    assert_eq!(stalled.unstalled(at(5000), at(9000)), Duration::from_secs(3), "at most");
 }

@@ -133,7 +133,6 @@ fn follow_for_ten_thousand_cycles(name: &str, open: impl Fn() -> MovableFrankaAr
     const MAX_ATTEMPTS: usize = 3;
     const BY_RAD: f64 = 0.3;
     const NEAR_RAD: f64 = 5e-3; // The joints of franka-sim have inertia.
-    const MAX_STALLED_FRAC: f64 = 0.2;
     for attempt in 1..=MAX_ATTEMPTS {
         let mut arm = open();
         let rest = arm.read(TEST_TIMEOUT).expect("the arm reports its joints").position;
@@ -162,11 +161,10 @@ fn follow_for_ten_thousand_cycles(name: &str, open: impl Fn() -> MovableFrankaAr
             assert!(off < NEAR_RAD, "{name}: {off} rad from its target");
         }
         let statistics = arm.motion_statistics();
-        let stalled_ms = stalls.stop().between(began, Instant::now()).as_millis();
-        let outcome = format!("{name}: {statistics}; stalled for {stalled_ms} ms");
+        let stalled_frac = stalls.stop().frac(began, Instant::now());
+        let outcome = format!("{name}: {statistics}; stalled for {:.1} % of the time", 100.0 * stalled_frac);
         report(&format!("our driver moves {outcome}\n"));
-        let stalled_frac = stalled_ms as f64 / (statistics.n_cycles + statistics.n_lost) as f64;
-        if is_in_time(&statistics, stalled_frac.min(MAX_STALLED_FRAC)) {
+        if is_in_time(&statistics, stalled_frac) {
             return;
         }
         assert!(attempt < MAX_ATTEMPTS, "{outcome}");

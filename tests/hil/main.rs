@@ -90,8 +90,7 @@ fn can_cards_in_virtual_machine() {
 /// Runs the tests inside a machine, unless a requirement is missing. `boot` returns the console output. `extra_files`
 /// are files that only this machine requires.
 ///
-/// An arm stops if its computer stalls, as virtual machines do while their host runs others. The tests are then run once
-/// more.
+/// A virtual machine stalls while its host runs others, and arms then stop. In that case, the tests are run once more.
 fn run_inside(extra_files: &[&str], boot: impl Fn() -> String) {
     let is_required = std::env::var(REQUIRE_HIL_VARIABLE).is_ok_and(|value| value == "demand");
     if let Some(reason) = missing_requirement(extra_files) {
@@ -108,7 +107,7 @@ fn run_inside(extra_files: &[&str], boot: impl Fn() -> String) {
         console
     };
     let mut console = boot();
-    // One test stalls a program on purpose, which then prints this as a child.
+    // One test stalls a child process on purpose, whose output begins with this.
     let is_stalled = |line: &str| line.contains(STALLED) && !line.contains("child: ");
     if !console.contains(PASSED) && console.lines().any(is_stalled) {
         console = boot();

@@ -297,9 +297,9 @@ fn check_picture(browser: &mut Browser, request: &RenderRequest) {
     assert_eq!([shot.width(), shot.height()], expected.size_px);
     let off_by = |dx: i64| {
         let (mut sum, mut n) = (0.0, 0.0);
-        // Away from the edges, which the toolbar and the inset cover.
-        for y in 80..i64::from(shot.height()) - 240 {
-            for x in (4..i64::from(shot.width()) - 4).step_by(3) {
+        let [columns, rows] = uncovered(expected.size_px);
+        for y in rows {
+            for x in columns.clone().step_by(3) {
                 let ix = usize::try_from(y * i64::from(shot.width()) + x).expect("inside") * 4;
                 let expected_pixel = &expected.rgba_srgb[ix..ix + 3];
                 sum += pixel(&shot, x + dx, y)
@@ -475,15 +475,25 @@ fn check_camera_path(browser: &mut Browser, request: &RenderRequest) {
     wait_for(browser, "a full picture", |browser| browser.text("picture-text").contains("100 %"));
 }
 
-/// While dragging, the page requests small pictures; at rest, full ones. The camera rotates around the center.
-fn check_drag(browser: &mut Browser, render_thread: &RenderThread, before: &RenderRequest) -> RenderRequest {
-    let n_before = render_thread.requests().len();
+/// Drags the view to the right and down.
+fn drag(browser: &mut Browser) {
     browser.mouse("mousePressed", [300, 300]);
     for ix in 0..12 {
         browser.mouse("mouseMoved", [300 + 12 * ix, 300 + 5 * ix]);
         std::thread::sleep(Duration::from_millis(30));
     }
     browser.mouse("mouseReleased", [432, 355]);
+}
+
+/// Columns and rows of a view away from its edges, which the toolbar and the inset cover.
+fn uncovered([width, height]: [u32; 2]) -> [std::ops::Range<i64>; 2] {
+    [4..i64::from(width) - 4, 80..i64::from(height) - 240]
+}
+
+/// While dragging, the page requests small pictures; at rest, full ones. The camera rotates around the center.
+fn check_drag(browser: &mut Browser, render_thread: &RenderThread, before: &RenderRequest) -> RenderRequest {
+    let n_before = render_thread.requests().len();
+    drag(browser);
     wait_for(browser, "a small picture", |browser| !browser.text("picture-text").contains("100 %"));
     wait_for(browser, "a full picture after the drag", |browser| browser.text("picture-text").contains("100 %"));
     let requests = render_thread.requests();
@@ -592,12 +602,19 @@ fn label(browser: &mut Browser) -> String {
     label.as_str().unwrap_or_default().to_owned()
 }
 
-/// Whether every open panel is below the toolbar, which has several rows in narrow windows, and in the view.
+/// Whether every panel, if it is opened, is below the toolbar, which has several rows in narrow windows, and in the view.
 fn panels_are_below_toolbar(browser: &mut Browser) -> bool {
     let expression = "(() => {
         const bounds = (id) => document.getElementById(id).getBoundingClientRect();
-        return [...document.querySelectorAll('.panel:not([hidden])')].every(({ id }) =>
-            bounds(id).top > bounds('toolbar').bottom && bounds(id).bottom < bounds('view').bottom);
+        const panels = [...document.querySelectorAll('.panel')];
+        const isRight = (panel) => {
+            const wereHidden = panels.map(({ hidden }) => hidden);
+            for (const other of panels) other.hidden = other !== panel;
+            const { top, bottom, height } = bounds(panel.id);
+            panels.forEach((other, ix) => other.hidden = wereHidden[ix]);
+            return top > bounds('toolbar').bottom && bottom < bounds('view').bottom && height > 40;
+        };
+        return panels.length === 3 && panels.every(isRight);
     })()";
     browser.evaluate(expression) == true
 }
@@ -639,7 +656,7 @@ impl Camera {
     }
 }
 
-/// Saves screenshots in both sizes, and returns to the size of the test.
+/// Saves screenshots in all sizes, and returns to the size of the test.
 fn save_and_restore(browser: &mut Browser, name: &str) {
     let bounds = canvas_bounds(browser);
     save_screenshot(browser, name);

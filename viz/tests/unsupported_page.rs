@@ -1,4 +1,4 @@
-//! Opens the page in a real browser that does not fit: against servers of older versions, and without graphics.
+//! Opens the page in a real browser where it cannot work as usual: with a server of an older version, without WebGL 2.
 //!
 //! Skipped, with a message, if Chromium or the bundle (`make web`) is missing.
 
@@ -86,15 +86,15 @@ fn page_works_with_an_older_server_or_says_why_not() {
     std::fs::remove_dir_all(&profile).expect("the browser has left its profile");
 }
 
-/// A browser without graphics, as in some remote desktops.
+/// Browsers without hardware acceleration, as in some remote desktops, have no WebGL 2.
 #[test]
-fn page_without_webgl_says_what_to_do() {
+fn page_without_webgl_shows_an_error() {
     const NO_WEBGL: &str = "HTMLCanvasElement.prototype.getContext = () => null";
     let Some(program) = browser_for_page() else { return };
     let profile = PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join(format!("no-webgl-{}", std::process::id()));
     let mut browser = Browser::open_with(&program, &profile, &serve(vec![hello(3)]), WINDOW_PX, NO_WEBGL);
     wait_for(&mut browser, "the reason", |browser| {
-        browser.text("banner").starts_with("This browser cannot draw the scene, because it offers no WebGL 2: turn on")
+        browser.text("banner").starts_with("WebGL 2 is not available in this browser: turn on")
     });
     assert_eq!(browser.text("connection"), "not connected");
     drop(browser);

@@ -5,7 +5,7 @@
 //!   real-time scheduling for it, and `statistics` measures delays and losses.
 //! * `movable` is an arm that may be moved. Commands pass through `mailbox` to `motion_loop`, which runs on the reading
 //!   thread. `reference` tracks the robot's commanded joint positions, `limits` has the motion limits, and `request`
-//!   encodes requests.
+//!   encodes requests. `recent_cycles` keeps the last cycles to explain a reflex.
 //! * `emulated` is an emulated controller for tests and simulators, behind the feature `emulation`.
 //!
 //! Motions use the wire structs of `franka-rs` instead of its `Robot`. `Robot` waits for answers without a time limit,

@@ -60,6 +60,8 @@ enum MotionState {
         id: u32,
         n_waited: u32,
         reason: Option<String>,
+        /// What happened before; empty without a reflex.
+        summary: String,
     },
 }
 
@@ -101,14 +103,14 @@ impl MotionLoop {
             MotionState::Beginning { id, n_waited } => self.start_motion(id, n_waited, stamped),
             MotionState::ActiveMotion(active) if state.robot_mode != RobotMode::Move => {
                 self.mailbox.update(|mailbox_state| mailbox_state.accepts_commands = false);
-                let reason = match state.robot_mode {
-                    RobotMode::Reflex => cause(state).map(|reason| self.explained(&reason, &active.recent)),
-                    _ => cause(state),
+                let summary = match state.robot_mode {
+                    RobotMode::Reflex => self.summary(&active.recent, stamped.numbered.number),
+                    _ => String::new(),
                 };
-                MotionState::Ending { id: active.id, n_waited: 0, reason }
+                MotionState::Ending { id: active.id, n_waited: 0, reason: cause(state), summary }
             }
             MotionState::ActiveMotion(active) => self.run(active, stamped),
-            MotionState::Ending { id, n_waited, reason } => self.conclude(id, n_waited, reason),
+            MotionState::Ending { id, n_waited, reason, summary } => self.conclude(id, n_waited, reason, summary),
         };
     }
 
@@ -261,10 +263,10 @@ impl MotionLoop {
         }
     }
 
-    /// Adds to the reason of a stop what happened before it, and logs the last cycles.
-    fn explained(&self, reason: &str, recent: &RecentCycles) -> String {
+    /// Summarizes the last cycles of a motion, and logs them. `number` is that of the state that reported its end.
+    fn summary(&self, recent: &RecentCycles, number: u64) -> String {
         log::debug!("{}: the last cycles before the stop: {}", self.device, recent.table());
-        format!("{reason}; {}", recent.summary())
+        recent.summary(number)
     }
 
     /// Makes the robot brake.
@@ -274,14 +276,14 @@ impl MotionLoop {
             Err(why) => format!("{reason}; {why}"),
         };
         self.mailbox.update(|mailbox_state| mailbox_state.accepts_commands = false);
-        MotionState::Ending { id, n_waited: 0, reason: Some(reason) }
+        MotionState::Ending { id, n_waited: 0, reason: Some(reason), summary: String::new() }
     }
 
     /// Waits for the robot's reply about a motion that has ended.
-    fn conclude(&self, id: u32, n_waited: u32, reason: Option<String>) -> MotionState {
+    fn conclude(&self, id: u32, n_waited: u32, reason: Option<String>, summary: String) -> MotionState {
         let reason = match request::outcome(&self.session, id) {
             Ok(None) if n_waited < MAX_STATES_UNTIL_RESPONSE => {
-                return MotionState::Ending { id, n_waited: n_waited + 1, reason };
+                return MotionState::Ending { id, n_waited: n_waited + 1, reason, summary };
             }
             Ok(Some(MotionResponse::Finished)) => reason,
             Ok(Some(MotionResponse::Rejected(why))) => {
@@ -292,7 +294,7 @@ impl MotionLoop {
             }
             Err(why) => Some(reason.unwrap_or(why)),
         };
-        self.finish(reason)
+        self.finish(reason.map(|reason| if summary.is_empty() { reason } else { format!("{reason}; {summary}") }))
     }
 
     /// Ends the motion. A `reason` means that it stopped because of a problem.

@@ -458,6 +458,8 @@ fn suspended_program_triggers_reflex_and_sends_nothing_stale() {
     signal("-CONT");
     let reason = text();
     assert!(reason.contains("reflex") && reason.contains("communication_constraints_violation"), "{reason}");
+    let n_lost = reason.split(" states were not received").next().and_then(|text| text.rsplit(' ').next());
+    assert!(n_lost.and_then(|n| n.parse::<u64>().ok()).is_some_and(|n_lost| n_lost >= 20), "{reason}");
     assert_eq!(text(), "quiet");
     assert_eq!(relay.faults.n_commands.load(Ordering::Relaxed), n_commands, "it sent a stale command");
     assert_eq!(text(), "held");

@@ -3,23 +3,30 @@
 use super::N_JOINTS;
 use super::reference::{CommandFate, Reference};
 use super::state::NumberedState;
-use franka::rate_limiting;
 use std::collections::VecDeque;
 use std::fmt::Write;
 
-/// What one state reported, and how it was answered.
+/// A state and our answer.
 #[derive(Debug)]
 struct Cycle {
     number: u64,
     /// Outcome of the previous command.
     fate: CommandFate,
-    /// Positions of the robot's reference according to our tracker, rad.
-    assumed_rad: [f64; N_JOINTS],
+    /// The robot's reference according to our tracker.
+    assumed: Reference,
     reported_rad: [f64; N_JOINTS],
     reported_rad_s: [f64; N_JOINTS],
     success_rate: f64,
-    /// The answer, rad.
     sent_rad: Option<[f64; N_JOINTS]>,
+}
+
+impl Cycle {
+    /// Joint with the largest acceleration to the sent positions, and this acceleration in rad/s².
+    fn largest_acceleration(&self) -> Option<(usize, f64)> {
+        let sent = self.assumed.sent(self.sent_rad?);
+        let accelerations = sent.acceleration_rad_s2.map(f64::abs).into_iter().enumerate();
+        accelerations.max_by(|a, b| a.1.total_cmp(&b.1))
+    }
 }
 
 /// The last cycles of a motion.
@@ -33,7 +40,7 @@ impl RecentCycles {
         Self(VecDeque::with_capacity(Self::MAX))
     }
 
-    /// Adds the cycle of this state. `fate` is the outcome of the command before it, `sent_rad` the answer to it.
+    /// Adds a state and our answer. `fate` is the outcome of the command before it, `assumed` our tracked reference.
     pub(super) fn push(
         &mut self,
         NumberedState { number, state }: &NumberedState,
@@ -47,7 +54,7 @@ impl RecentCycles {
         self.0.push_back(Cycle {
             number: *number,
             fate,
-            assumed_rad: assumed.position_rad,
+            assumed: *assumed,
             reported_rad: state.q_d,
             reported_rad_s: state.dq_d,
             success_rate: state.control_command_success_rate,
@@ -55,22 +62,21 @@ impl RecentCycles {
         });
     }
 
-    /// Missed and unsent commands, and the largest commanded acceleration of a joint.
-    pub(super) fn summary(&self) -> String {
+    /// Missed and unsent commands, lost states, and the largest acceleration that was sent. `last_number` is the number
+    /// of the state that reported the end of the motion.
+    pub(super) fn summary(&self, last_number: u64) -> String {
         let n_missed: u64 = self.0.iter().map(|cycle| cycle.fate.n_missed()).sum();
         let n_unsent = self.0.iter().filter(|cycle| cycle.sent_rad.is_none()).count();
+        let numbers = self.0.iter().map(|cycle| cycle.number).chain([last_number]);
+        let n_lost: u64 = numbers.clone().zip(numbers.skip(1)).map(|(from, to)| to.saturating_sub(from + 1)).sum();
         let mut text = format!(
-            "in the last {} cycles, the robot missed {n_missed} commands, and {n_unsent} were not sent in time",
+            "in the last {} cycles, the robot missed {n_missed} commands, {n_unsent} were not sent in time, and {n_lost} \
+             states were not received",
             self.0.len()
         );
-        let pairs = self.0.iter().zip(self.0.iter().skip(1)).filter(|(before, after)| after.number > before.number);
-        let accelerations = pairs.flat_map(|(before, after)| {
-            let secs = (after.number - before.number) as f64 * rate_limiting::DELTA_T;
-            let change = move |joint: usize| after.reported_rad_s[joint] - before.reported_rad_s[joint];
-            (0..N_JOINTS).map(move |joint| (joint, change(joint).abs() / secs))
-        });
+        let accelerations = self.0.iter().filter_map(Cycle::largest_acceleration);
         if let Some((joint, acceleration)) = accelerations.max_by(|a, b| a.1.total_cmp(&b.1)) {
-            let _ = write!(text, "; joint {} was commanded up to {acceleration:.2} rad/s²", joint + 1);
+            let _ = write!(text, "; largest commanded acceleration {acceleration:.2} rad/s² (joint {})", joint + 1);
         }
         text
     }
@@ -81,8 +87,9 @@ impl RecentCycles {
             joint positions, rad: reported, assumed, sent; reported velocities, rad/s";
         let mut text = HEADER.to_owned();
         for cycle in &self.0 {
-            let Cycle { number, fate, success_rate, reported_rad, assumed_rad, sent_rad, reported_rad_s } = cycle;
-            let _ = write!(text, "\n{number} {fate:?} {success_rate:.2}; {reported_rad:.7?} {assumed_rad:.7?} ");
+            let Cycle { number, fate, success_rate, reported_rad, assumed, sent_rad, reported_rad_s } = cycle;
+            let _ =
+                write!(text, "\n{number} {fate:?} {success_rate:.2}; {reported_rad:.7?} {:.7?} ", assumed.position_rad);
             let _ = write!(text, "{sent_rad:.7?}; {reported_rad_s:.6?}");
         }
         text
@@ -95,26 +102,26 @@ mod tests {
     use franka::RobotState;
 
     #[test]
-    fn summary_counts_missed_commands_and_names_the_fastest_change() {
+    fn summary_counts_losses_and_reports_the_largest_acceleration() {
         let mut recent = RecentCycles::new();
-        // The number 104 arrives twice, and 102 is lost.
-        let numbers = [100, 101, 103, 104, 104];
-        let fates = [CommandFate::Followed, CommandFate::Missed(1), CommandFate::Missed(2), CommandFate::Followed];
-        for (ix, number) in numbers.into_iter().enumerate() {
-            let mut state = RobotState::default();
-            state.dq_d[4] = if number >= 103 { 0.006 } else { 0.0 };
-            let fate = fates.get(ix).copied().unwrap_or(CommandFate::Followed);
-            let sent = (number != 104).then_some([0.1; N_JOINTS]);
-            recent.push(&NumberedState { number, state }, fate, &Reference::at_rest(&RobotState::default()), sent);
-        }
-        let expected = "in the last 5 cycles, the robot missed 3 commands, and 2 were not sent in time; \
-                        joint 5 was commanded up to 3.00 rad/s²";
-        assert_eq!(recent.summary(), expected);
-        assert_eq!(recent.table().lines().count(), 1 + numbers.len());
-        for number in 105..300 {
+        let reference = Reference::at_rest(&RobotState::default());
+        let mut push = |number: u64, fate, sent_rad| {
+            recent.push(&NumberedState { number, state: RobotState::default() }, fate, &reference, sent_rad);
+        };
+        // In a millisecond, 3 micrometers are 3 rad/s².
+        let mut jump = [0.0; N_JOINTS];
+        jump[4] = 3e-6;
+        push(100, CommandFate::Followed, Some([0.0; N_JOINTS]));
+        push(101, CommandFate::Missed(1), Some(jump));
+        push(103, CommandFate::Missed(2), None);
+        let expected = "in the last 3 cycles, the robot missed 3 commands, 1 were not sent in time, and 31 states were \
+                        not received; largest commanded acceleration 3.00 rad/s² (joint 5)";
+        assert_eq!(recent.summary(134), expected);
+        assert_eq!(recent.table().lines().count(), 1 + 3);
+        for number in 104..300 {
             let numbered = NumberedState { number, state: RobotState::default() };
-            recent.push(&numbered, CommandFate::Followed, &Reference::at_rest(&numbered.state), None);
+            recent.push(&numbered, CommandFate::Followed, &reference, None);
         }
-        assert!(recent.summary().starts_with("in the last 60 cycles, the robot missed 0 commands"));
+        assert!(recent.summary(300).starts_with("in the last 60 cycles, the robot missed 0 commands, 60 were not"));
     }
 }

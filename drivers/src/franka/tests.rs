@@ -77,7 +77,6 @@ fn ten_thousand_states_are_received_in_both_versions() {
     // Loopback loses nothing; a busy machine may fail to send or receive some states in time, and while a processor is
     // stalled, states are lost.
     const MIN_FRAC: f64 = 0.99;
-    const MAX_STALLED_FRAC: f64 = 0.2;
     // Maximum delay of a stamp, from the wake-up latency of one thread.
     const MAX_LATE_SECS: f64 = 5e-3;
     for version in VERSIONS {
@@ -99,13 +98,12 @@ fn ten_thousand_states_are_received_in_both_versions() {
             assert_eq!(state.effort, truth.torque_nm);
         }
         let statistics = arm.statistics();
-        let now = Instant::now();
-        let stalled = stalls.stop().between(began, now).as_secs_f64();
-        let stalled_frac = (stalled / (now - began).as_secs_f64()).min(MAX_STALLED_FRAC);
+        let stalled_frac = stalls.stop().frac(began, Instant::now());
         eprintln!("{version:?}: {statistics}; positions at their stamps within {max_error:.1e} rad");
         assert!(
             statistics.success_frac() > MIN_FRAC - stalled_frac,
-            "{version:?}: {statistics}; stalled for {stalled:.3} s"
+            "{version:?}: {statistics}; stalled for {:.1} % of the time",
+            100.0 * stalled_frac
         );
         assert!(max_error < 0.4 * MAX_LATE_SECS, "{version:?}: {max_error} rad; {statistics}");
     }

@@ -2,7 +2,7 @@
 
 use crate::analytic_scene::{draw, ray_in_world};
 use crate::browser::{Browser, canvas_shot, wait_for};
-use crate::{BACKGROUND, RenderThread, pixel, pixel_of, reset_view};
+use crate::{BACKGROUND, RenderThread, drag, pixel, pixel_of, reset_view, uncovered};
 use std::path::PathBuf;
 use std::sync::atomic::Ordering;
 use std::time::Duration;
@@ -10,36 +10,49 @@ use trainer::{Projection, RenderRequest};
 
 type Color = [u8; 3];
 
-/// Checks that a moved view shows everything that the last picture shows, and that nothing is stretched over depth edges.
+/// Keeps pictures waiting. Dropped, also by a panic, it lets the thread that draws them end.
+struct Paused<'a>(&'a RenderThread);
+
+impl<'a> Paused<'a> {
+    fn new(thread: &'a RenderThread) -> Self {
+        thread.is_paused.store(true, Ordering::Relaxed);
+        Self(thread)
+    }
+}
+
+impl Drop for Paused<'_> {
+    fn drop(&mut self) {
+        self.0.is_paused.store(false, Ordering::Relaxed);
+    }
+}
+
+/// Checks that a moved view shows everything that the last picture shows, and that little is stretched over depth
+/// discontinuities.
 pub(crate) fn check(browser: &mut Browser, render_thread: &RenderThread, picture: &RenderRequest) {
-    /// Because of compression, and of the shading of a ball within a pixel.
+    /// Allows for JPEG compression and for shading within a pixel.
     const MAX_COLOR_DIFFERENCE: u8 = 40;
     browser.click("toggle-grid");
-    render_thread.is_paused.store(true, Ordering::Relaxed);
-    browser.mouse("mousePressed", [300, 300]);
-    for ix in 0..12 {
-        browser.mouse("mouseMoved", [300 + 12 * ix, 300 + 5 * ix]);
-    }
-    browser.mouse("mouseReleased", [432, 355]);
+    let paused = Paused::new(render_thread);
+    drag(browser);
     std::thread::sleep(Duration::from_millis(800)); // The view no longer moves.
     let shot = canvas_shot(browser);
     shot.save(PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join("page-moved-picture.png")).expect("written");
-    render_thread.is_paused.store(false, Ordering::Relaxed);
+    drop(paused);
     wait_for(browser, "a full picture", |_| {
         render_thread.requests().last().is_some_and(|request| request.size_px == picture.size_px)
     });
     let view = render_thread.requests().last().expect("drawn").clone();
     let expected = moved_picture(picture, &view);
-    let [width, height] = view.size_px.map(i64::from);
+    let width = i64::from(view.size_px[0]);
     // The expected colors within 2 pixels.
     let near = |x: i64, y: i64| -> Vec<Option<Color>> {
         let row = |y: i64| usize::try_from(y * width + x - 2).expect("inside");
         (y - 2..=y + 2).flat_map(|y| expected[row(y)..][..5].iter().copied()).collect()
     };
     let (mut n_seen, mut n_missing, mut n_stretched) = (0, 0, 0);
-    // Away from the edges, which the toolbar and the inset cover.
-    for y in 80..height - 240 {
-        for x in 4..width - 4 {
+    let [columns, rows] = uncovered(view.size_px);
+    for y in rows {
+        for x in columns.clone() {
             let (shown, near) = (pixel(&shot, x, y), near(x, y));
             let is_like =
                 |expected: Color| shown.iter().zip(expected).all(|(a, b)| a.abs_diff(b) < MAX_COLOR_DIFFERENCE);
@@ -56,7 +69,7 @@ pub(crate) fn check(browser: &mut Browser, render_thread: &RenderThread, picture
     reset_view(browser, render_thread, picture);
 }
 
-/// The view that shows what a picture shows, and nothing else; `None` where there is nothing.
+/// Projects what a picture shows into a view; `None` where there is nothing.
 fn moved_picture(picture: &RenderRequest, view: &RenderRequest) -> Vec<Option<Color>> {
     /// Samples per pixel and axis, so that a closer view has no gaps.
     const N_SAMPLES: u32 = 3;

@@ -12,7 +12,7 @@ export class Banner {
   private guidance: Guidance | null = null;
   private graphics = "";
 
-  /** Says why nothing can be drawn; an empty text if it can. */
+  /** Sets the reason why the scene cannot be drawn; empty if it can. */
   setGraphics(text: string): void {
     this.graphics = text;
     this.show();
@@ -44,13 +44,13 @@ export class Banner {
     // Once a run has ended, a stopped server is expected.
     const { result, guidance, isFinished } = this;
     const hasProblem = isBroken && !isFinished;
-    const text =
-      this.graphics ||
-      (result ? runResultText(result) : capitalized(hasProblem ? this.connectionText : (guidance?.text ?? "")));
+    const text = result
+      ? runResultText(result)
+      : capitalized(hasProblem ? this.connectionText : (guidance?.text ?? this.graphics));
     const banner = element("banner");
     if (banner.textContent !== text) banner.textContent = text; // Otherwise screen readers would repeat it.
-    const kind = isFinished ? "finished" : hasProblem || !guidance ? this.connection : "guidance";
-    banner.dataset.kind = this.graphics ? "graphics" : kind;
+    const withoutProblem = guidance ? "guidance" : this.graphics ? "graphics" : this.connection;
+    banner.dataset.kind = isFinished ? "finished" : hasProblem ? this.connection : withoutProblem;
     element("view").classList.toggle("stale", hasProblem);
   }
 }

@@ -73,6 +73,11 @@ export class LocalModel {
     this.changed();
   }
 
+  /** To be called when the WebGL context is restored. */
+  contextRestored(): void {
+    this.splats.contextRestored();
+  }
+
   /** Adds a chunk or replaces its older version. */
   receive(header: ModelChunkHeader, payload: Uint8Array<ArrayBuffer>): void {
     if (header.method !== this.drawn) return;

@@ -107,25 +107,25 @@ const surroundings = new Surroundings(
 const settings = new ViewSettings(view, scheduler, sides[1]);
 
 function openView(): OrbitView {
-  const canvas = element("canvas", HTMLCanvasElement);
-  try {
-    const view = new OrbitView(canvas, () => scheduler.moved(), () => connection.clock);
-    // Phones take the graphics of pages in the background. These listeners are called after those of the renderer.
-    canvas.addEventListener("webglcontextlost", () => {
-      banner.setGraphics("The browser has stopped the graphics of this page");
-    });
-    canvas.addEventListener("webglcontextrestored", () => {
-      banner.setGraphics("");
-      view.restoreGraphics();
-    });
-    return view;
-  } catch (error) {
+  if (!document.createElement("canvas").getContext("webgl2")) {
+    const reason =
+      "WebGL 2 is not available in this browser: turn on hardware acceleration in its settings, or use a newer browser";
     element("connection").textContent = "not connected";
-    banner.setGraphics(
-      "This browser cannot draw the scene, because it offers no WebGL 2: turn on hardware acceleration in its settings, or use a newer browser",
-    );
-    throw error;
+    banner.setGraphics(reason);
+    throw new Error(reason);
   }
+  const canvas = element("canvas", HTMLCanvasElement);
+  const view = new OrbitView(canvas, () => scheduler.moved(), () => connection.clock);
+  // Mobile browsers take the WebGL context from pages in the background. These listeners are called after those of the
+  // renderer.
+  canvas.addEventListener("webglcontextlost", () => {
+    banner.setGraphics("The WebGL context of this page was lost: if the scene does not return, reload the page");
+  });
+  canvas.addEventListener("webglcontextrestored", () => {
+    banner.setGraphics("");
+    view.contextRestored();
+  });
+  return view;
 }
 
 function receiveText(message: TextMessage): void {

@@ -81,7 +81,7 @@ export class OrbitView {
     // Colors arrive as sRGB and are output unchanged.
     this.renderer.outputColorSpace = THREE.LinearSRGBColorSpace;
     THREE.ColorManagement.enabled = false;
-    this.restoreGraphics();
+    this.renderer.setClearColor(new THREE.Color(...BACKGROUND));
     this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
     this.camera.up.set(0, 0, 1);
     this.camera.position.set(1, -1, 1);
@@ -115,9 +115,10 @@ export class OrbitView {
     this.fit();
   }
 
-  /** Sets what the renderer forgets with the graphics context, and draws again. */
-  restoreGraphics(): void {
+  /** Restores what was lost with the WebGL context, and draws again. To be called after the renderer's own listener. */
+  contextRestored(): void {
     this.renderer.setClearColor(new THREE.Color(...BACKGROUND));
+    this.local.contextRestored();
     this.changed();
   }
 

@@ -56,7 +56,7 @@ const FRAGMENT = /* glsl */ `${TINT}
     return min(abs(depthAt(uv - stepUv) - depth), abs(depthAt(uv + stepUv) - depth));
   }
 
-  /** Largest difference between the depth of the grid and that of the picture, meters. */
+  /** Maximum difference between the depth of the grid and that of the picture, meters. */
   float tolerance(vec2 uv, float depth) {
     float largest = 0.08 * min(depth, pointInPicture.z);
     vec3 normal = normalize(cross(dFdx(pointInPicture), dFdy(pointInPicture)));
@@ -70,11 +70,12 @@ const FRAGMENT = /* glsl */ `${TINT}
 
   void main() {
     vec2 uv = (focalPx * pointInPicture.xy / pointInPicture.z + principalPx) / sizePx;
-    float depth = depthAt(uv);
+    float measured = texture2D(depthMap, uv).r;
+    bool isEmpty = !(measured > 0.0);
+    float depth = isEmpty ? emptyDepth : measured;
     if (isMoved && abs(pointInPicture.z - depth) > tolerance(uv, depth)) discard;
     vec3 pointInWorld = (worldFromPicture * vec4(pointInPicture * (depth / pointInPicture.z), 1.0)).xyz;
     vec3 color = texture2D(colorMap, uv).rgb;
-    bool isEmpty = !(texture2D(depthMap, uv).r > 0.0);
     gl_FragColor = vec4(isEmpty ? color : tinted(color, pointInWorld), opacity);
   }`;
 

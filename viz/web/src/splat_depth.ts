@@ -22,6 +22,11 @@ export class SplatDepth {
     this.material.defines = { WRITES_DEPTH: 1 };
   }
 
+  /** Checks again what the GPU can draw: a lost WebGL context can draw nothing. */
+  contextRestored(): void {
+    this.isPossible = null;
+  }
+
   /**
    * Draws the splats of a mesh. The texture holds the sum of the weighted depths, meters, and of the weights. Returns
    * null if the GPU cannot draw to textures of floats.

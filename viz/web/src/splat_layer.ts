@@ -64,6 +64,12 @@ export class SplatLayer {
     this.crop = undefined;
   }
 
+  /** To be called when the WebGL context is restored. */
+  contextRestored(): void {
+    this.memory.uploadAgain();
+    this.depth.contextRestored();
+  }
+
   /** Adds a chunk or replaces its older version. */
   set(header: SplatChunkHeader, payload: Uint8Array<ArrayBuffer>): void {
     const nWords = 4 * header.n_splats * (header.sh_degree > 0 ? 2 : 1);

@@ -20,6 +20,15 @@ export class SplatMemory {
   private nUnits = 0;
   private readonly unused: number[] = [];
 
+  /** Uploads everything again, because the WebGL context has lost it. */
+  uploadAgain(): void {
+    for (const texture of [this.base, this.harmonics, this.units]) {
+      texture.clearUpdateRanges();
+      texture.userData.isUploaded = false;
+      texture.needsUpdate = true;
+    }
+  }
+
   /** Number of splats for which there is memory. */
   get capacity(): number {
     return this.nRows * ROW_SPLATS;
