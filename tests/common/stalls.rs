@@ -74,18 +74,17 @@ pub(crate) struct StalledTimes {
     stalled_ms: BTreeSet<u128>,
 }
 
-#[allow(dead_code, reason = "each test needs one of the methods")]
 impl StalledTimes {
-    /// The share of the time between two times for which a processor was stalled. It is at most 20 %, so that a stalled
-    /// machine does not excuse everything.
+    /// Fraction of the time between two instants in which a processor was stalled; at most 20 %, so that a stalled machine
+    /// does not excuse every failure.
     pub(crate) fn frac(&self, from: Instant, to: Instant) -> f64 {
         const MAX_FRAC: f64 = 0.2;
         let n_ms = self.stalled_ms.range(self.range_ms(from, to)).count();
         (n_ms as f64 * 1e-3 / (to - from).as_secs_f64()).min(MAX_FRAC)
     }
 
-    /// The time between two times without long stalls. Shorter ones also result from ordinary load, and more than a
-    /// second is not excused.
+    /// Time between two instants, without long stalls; at most one second is excluded. Short stalls also occur under
+    /// ordinary load.
     pub(crate) fn unstalled(&self, from: Instant, to: Instant) -> Duration {
         const MIN_LONG_MS: usize = 20;
         const MAX_EXCUSED: Duration = Duration::from_secs(1);

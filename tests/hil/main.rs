@@ -90,7 +90,7 @@ fn can_cards_in_virtual_machine() {
 /// Runs the tests inside a machine, unless a requirement is missing. `boot` returns the console output. `extra_files`
 /// are files that only this machine requires.
 ///
-/// A virtual machine stalls while its host runs others, and arms then stop. In that case, the tests are run once more.
+/// A virtual machine stalls while its host runs others, and a stall stops an arm. The tests are then run once more.
 fn run_inside(extra_files: &[&str], boot: impl Fn() -> String) {
     let is_required = std::env::var(REQUIRE_HIL_VARIABLE).is_ok_and(|value| value == "demand");
     if let Some(reason) = missing_requirement(extra_files) {

@@ -71,8 +71,8 @@ fn check_local(browser: &mut Browser, thread: &ModelThread, model: &mut dyn Meth
     }
 }
 
-/// Takes the WebGL context from the page and returns it, as mobile browsers do with pages in the background. Meanwhile,
-/// the page receives the model again.
+/// Loses and restores the WebGL context of the page, as mobile browsers do with background pages. In between, the page
+/// receives the model again.
 fn lose_context(browser: &mut Browser) {
     const GET: &str = "window.context ??= document.getElementById('canvas').getContext('webgl2').getExtension(\
                        'WEBGL_lose_context')";

@@ -60,7 +60,7 @@ enum MotionState {
         id: u32,
         n_waited: u32,
         reason: Option<String>,
-        /// What happened before; empty without a reflex.
+        /// Summary of the last cycles before a reflex; empty if there was no reflex.
         summary: String,
     },
 }
@@ -205,7 +205,7 @@ impl MotionLoop {
         mailbox_state.statistics.n_lost += n_states.saturating_sub(1);
         mailbox_state.statistics.n_stale += u64::from(!stamped.is_fresh);
         mailbox_state.statistics.n_missed += fate.n_missed();
-        // Before, the window of the success rate is not full.
+        // Until then, the window of the success rate is not full.
         if active.n_cycles > N_SUCCESS_WINDOW {
             mailbox_state.statistics.count_robot_success(stamped.numbered.state.control_command_success_rate);
         }
@@ -263,7 +263,7 @@ impl MotionLoop {
         }
     }
 
-    /// Summarizes the last cycles of a motion, and logs them. `number` is that of the state that reported its end.
+    /// Summarizes and logs the last cycles of a motion. `number` is the number of the state that reported its end.
     fn summary(&self, recent: &RecentCycles, number: u64) -> String {
         log::debug!("{}: the last cycles before the stop: {}", self.device, recent.table());
         recent.summary(number)

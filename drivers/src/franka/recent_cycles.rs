@@ -21,7 +21,7 @@ struct Cycle {
 }
 
 impl Cycle {
-    /// Joint with the largest acceleration to the sent positions, and this acceleration in rad/s².
+    /// Joint with the largest commanded acceleration, and that acceleration in rad/s².
     fn largest_acceleration(&self) -> Option<(usize, f64)> {
         let sent = self.assumed.sent(self.sent_rad?);
         let accelerations = sent.acceleration_rad_s2.map(f64::abs).into_iter().enumerate();
@@ -62,8 +62,8 @@ impl RecentCycles {
         });
     }
 
-    /// Missed and unsent commands, lost states, and the largest acceleration that was sent. `last_number` is the number
-    /// of the state that reported the end of the motion.
+    /// Reports missed and unsent commands, lost states, and the largest commanded acceleration. `last_number` is the
+    /// number of the state that reported the end of the motion.
     pub(super) fn summary(&self, last_number: u64) -> String {
         let n_missed: u64 = self.0.iter().map(|cycle| cycle.fate.n_missed()).sum();
         let n_unsent = self.0.iter().filter(|cycle| cycle.sent_rad.is_none()).count();

@@ -10,7 +10,7 @@ use trainer::{Projection, RenderRequest};
 
 type Color = [u8; 3];
 
-/// Keeps pictures waiting. Dropped, also by a panic, it lets the thread that draws them end.
+/// Holds back pictures. Dropping it, also in a panic, unblocks the thread that draws them.
 struct Paused<'a>(&'a RenderThread);
 
 impl<'a> Paused<'a> {

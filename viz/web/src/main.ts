@@ -116,8 +116,7 @@ function openView(): OrbitView {
   }
   const canvas = element("canvas", HTMLCanvasElement);
   const view = new OrbitView(canvas, () => scheduler.moved(), () => connection.clock);
-  // Mobile browsers take the WebGL context from pages in the background. These listeners are called after those of the
-  // renderer.
+  // Mobile browsers discard the WebGL context of background pages. These listeners must run after the renderer's.
   canvas.addEventListener("webglcontextlost", () => {
     banner.setGraphics("The WebGL context of this page was lost: if the scene does not return, reload the page");
   });

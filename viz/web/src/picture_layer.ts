@@ -15,28 +15,34 @@ import type { PosedDepth } from "./surface_picker";
 const N_COLUMNS = 256;
 const N_ROWS = 144;
 
-const VERTEX = /* glsl */ `
-  uniform sampler2D depthMap;
+const DEPTH = /* glsl */ `
+  uniform sampler2D depthMap; // meters, 0 without a surface
+  uniform float emptyDepth;
+
+  float orEmpty(float depth) {
+    return depth > 0.0 ? depth : emptyDepth;
+  }
+
+  float depthAt(vec2 uv) {
+    return orEmpty(texture2D(depthMap, uv).r);
+  }`;
+
+const VERTEX = /* glsl */ `${DEPTH}
   uniform mat4 worldFromPicture;
   uniform vec2 sizePx;
   uniform vec2 focalPx;
   uniform vec2 principalPx;
-  uniform float emptyDepth;
   varying vec3 pointInPicture;
   void main() {
     vec2 uv = position.xy;
-    float depth = texture2D(depthMap, uv).r;
-    if (!(depth > 0.0)) depth = emptyDepth;
-    pointInPicture = vec3((uv * sizePx - principalPx) / focalPx, 1.0) * depth;
+    pointInPicture = vec3((uv * sizePx - principalPx) / focalPx, 1.0) * depthAt(uv);
     gl_Position = projectionMatrix * viewMatrix * worldFromPicture * vec4(pointInPicture, 1.0);
   }`;
 
 // Colors are looked up by projection, not by the grid's own coordinates, so that the view from the picture's pose is
 // exact even where a triangle spans a depth discontinuity.
-const FRAGMENT = /* glsl */ `${TINT}
+const FRAGMENT = /* glsl */ `${TINT}${DEPTH}
   uniform sampler2D colorMap;
-  uniform sampler2D depthMap;
-  uniform float emptyDepth;
   uniform float opacity;
   uniform bool isMoved;
   uniform vec2 sizePx;
@@ -45,13 +51,8 @@ const FRAGMENT = /* glsl */ `${TINT}
   uniform mat4 worldFromPicture;
   varying vec3 pointInPicture;
 
-  float depthAt(vec2 uv) {
-    float depth = texture2D(depthMap, uv).r;
-    return depth > 0.0 ? depth : emptyDepth;
-  }
-
-  /** The smaller depth difference to the two neighbors along an axis: the slope, also next to a discontinuity. */
-  float slope(vec2 uv, float depth, vec2 axis) {
+  /** Depth difference to the neighbor with the more similar depth, so that discontinuities do not count. */
+  float depthStep(vec2 uv, float depth, vec2 axis) {
     vec2 stepUv = axis / vec2(textureSize(depthMap, 0));
     return min(abs(depthAt(uv - stepUv) - depth), abs(depthAt(uv + stepUv) - depth));
   }
@@ -64,19 +65,18 @@ const FRAGMENT = /* glsl */ `${TINT}
     // The triangle is almost parallel to the rays of the picture. Either it spans a discontinuity, or it belongs to a
     // surface seen at a grazing angle, whose depth changes within a pixel.
     float stepPx = sizePx.x / float(textureSize(depthMap, 0).x);
-    float slopes = slope(uv, depth, vec2(1.0, 0.0)) + slope(uv, depth, vec2(0.0, 1.0));
-    return min(largest, min(0.01 * stepPx * depth, 0.005 * depth + 1.5 * slopes));
+    float depthSteps = depthStep(uv, depth, vec2(1.0, 0.0)) + depthStep(uv, depth, vec2(0.0, 1.0));
+    return min(largest, min(0.01 * stepPx * depth, 0.005 * depth + 1.5 * depthSteps));
   }
 
   void main() {
     vec2 uv = (focalPx * pointInPicture.xy / pointInPicture.z + principalPx) / sizePx;
-    float measured = texture2D(depthMap, uv).r;
-    bool isEmpty = !(measured > 0.0);
-    float depth = isEmpty ? emptyDepth : measured;
+    float rendered = texture2D(depthMap, uv).r;
+    float depth = orEmpty(rendered);
     if (isMoved && abs(pointInPicture.z - depth) > tolerance(uv, depth)) discard;
     vec3 pointInWorld = (worldFromPicture * vec4(pointInPicture * (depth / pointInPicture.z), 1.0)).xyz;
     vec3 color = texture2D(colorMap, uv).rgb;
-    gl_FragColor = vec4(isEmpty ? color : tinted(color, pointInWorld), opacity);
+    gl_FragColor = vec4(rendered > 0.0 ? tinted(color, pointInWorld) : color, opacity);
   }`;
 
 /** A picture that has been received, and what becomes of it: whether it is shown. */
