@@ -45,9 +45,6 @@ mod stamp_clock;
 mod stations;
 mod stop;
 mod supervised_arm;
-#[cfg(test)]
-#[path = "../../tests/common/test_data.rs"]
-mod test_data;
 
 pub use arm_capture::ArmCapture;
 pub use calibration_images::{ArmDuringImage, CalibrationImage, CalibrationImages, calibration_images};

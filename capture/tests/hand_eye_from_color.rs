@@ -1,8 +1,5 @@
 //! Estimates a hand-eye transform from the color images of a real arm. Skipped without the test data.
 
-#[path = "../../tests/common/test_data.rs"]
-mod test_data;
-
 use calibration::{Alignment, CameraRefinement, ParamSet, align, rigid_transform};
 use keyframe::{Holdout, Keyframe};
 use kinematics::Transform;
@@ -19,7 +16,7 @@ fn correction(alignment: &Alignment) -> Transform {
 
 #[test]
 fn hidden_error_of_a_real_arm_is_removed() {
-    let Some(folder) = test_data::folder("arm_scan") else { return };
+    let Some(folder) = test_support::data_folder("arm_scan") else { return };
     let dataset = drivers::dataset::read(&folder).unwrap();
     let keyframes = capture::dataset::load(&dataset, &Holdout::default(), 0.5, &|_| ()).unwrap().keyframes;
     // The published transform itself has an error of about 0.4 degrees and 9 mm.

@@ -41,9 +41,6 @@ mod sample;
 #[cfg(test)]
 mod scripted;
 pub mod tags;
-#[cfg(test)]
-#[path = "../../tests/common/test_data.rs"]
-mod test_data;
 pub mod udp;
 pub mod v4l2;
 pub mod wire;

@@ -5,21 +5,9 @@ use kinematics::Chain;
 use kinematics::urdf::Robot;
 use nalgebra::Matrix4;
 use serde_json::Value;
-use std::path::PathBuf;
 
 /// Meters and rotation matrix elements. Rounding differs between the libraries by a few 1e-16 per joint.
 const CLOSE: f64 = 1e-12;
-
-fn robots() -> Option<PathBuf> {
-    let data = std::env::var("FIELDRIG_TEST_DATA")
-        .map_or_else(|_| PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/../../shared/data")), PathBuf::from);
-    let robots = data.join("robots");
-    if robots.is_dir() {
-        return Some(robots);
-    }
-    eprintln!("skipped: no test data at {}", robots.display());
-    None
-}
 
 fn numbers(value: &Value) -> Vec<f64> {
     value.as_array().unwrap().iter().map(|number| number.as_f64().unwrap()).collect()
@@ -31,7 +19,7 @@ fn words(value: &Value) -> Vec<String> {
 
 #[test]
 fn poses_match_independent_library() {
-    let Some(robots) = robots() else { return };
+    let Some(robots) = test_support::data_folder("robots") else { return };
     let mut n_poses = 0;
     let mut max_difference: f64 = 0.0;
     for entry in robots.read_dir().unwrap() {
@@ -67,7 +55,7 @@ fn poses_match_independent_library() {
 
 #[test]
 fn file_without_robot_is_rejected() {
-    let Some(robots) = robots() else { return };
+    let Some(robots) = test_support::data_folder("robots") else { return };
     let urdf = std::fs::read_to_string(robots.join("invalid_ur3.urdf")).unwrap();
     let message = Chain::from_urdf(&urdf, "base_link", "tool0").unwrap_err().to_string();
     assert_eq!(message, r#"urdf: robot "" has no <link> (an export that failed or was never expanded from xacro?)"#);

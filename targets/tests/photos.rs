@@ -5,17 +5,6 @@
 use std::path::{Path, PathBuf};
 use targets::{GrayImage, TargetSpec};
 
-/// A folder of the test data, in `FIELDRIG_TEST_DATA` or next to the project.
-fn folder(name: &str) -> Option<PathBuf> {
-    let default_folder = || Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared/data");
-    let folder = std::env::var_os("FIELDRIG_TEST_DATA").map_or_else(default_folder, PathBuf::from).join(name);
-    if !folder.is_dir() {
-        eprintln!("skipped: no test data at {}", folder.display());
-        return None;
-    }
-    Some(folder)
-}
-
 /// For every photo in a folder, the part of the target's corners that is detected.
 fn detected_parts(spec: &str, folder: &Path) -> Vec<f64> {
     let target: TargetSpec = spec.parse().unwrap();
@@ -39,7 +28,7 @@ fn detected_parts(spec: &str, folder: &Path) -> Vec<f64> {
 #[test]
 fn chessboards_are_found_completely() {
     for (name, spec) in [("chessboard", "chessboard:9x6:25mm"), ("handeye/koide_a", "chessboard:11x9:20.2mm")] {
-        let Some(folder) = folder(name) else { return };
+        let Some(folder) = test_support::data_folder(name) else { return };
         let parts = detected_parts(spec, &folder);
         assert!(parts.len() > 10 && parts.iter().all(|part| *part == 1.0), "{name}: {parts:?}");
     }
@@ -47,7 +36,7 @@ fn chessboards_are_found_completely() {
 
 #[test]
 fn wrong_counts_are_named_in_photos() {
-    let Some(folder) = folder("chessboard") else { return };
+    let Some(folder) = test_support::data_folder("chessboard") else { return };
     let photo = image::open(folder.join("left01.jpg")).unwrap().to_luma8();
     let target: TargetSpec = "chessboard:8x6:25mm".parse().unwrap();
     let image = GrayImage { size_px: [photo.width(), photo.height()], pixels: photo.as_raw() };
@@ -57,7 +46,7 @@ fn wrong_counts_are_named_in_photos() {
 
 #[test]
 fn parts_of_larger_boards_are_not_accepted() {
-    let Some(folder) = folder("chessboard") else { return };
+    let Some(folder) = test_support::data_folder("chessboard") else { return };
     for spec in ["chessboard:8x6:25mm", "chessboard:9x5:25mm", "chessboard:7x5:25mm"] {
         let parts = detected_parts(spec, &folder);
         assert!(parts.len() > 10 && parts.iter().all(|part| *part == 0.0), "{spec}: {parts:?}");
@@ -66,7 +55,7 @@ fn parts_of_larger_boards_are_not_accepted() {
 
 #[test]
 fn small_charuco_boards_are_found() {
-    let Some(folder) = folder("arm_scan") else { return };
+    let Some(folder) = test_support::data_folder("arm_scan") else { return };
     let parts = detected_parts("charuco:9x6:40mm:35mm:4X4_250", &folder.join("images"));
     let mean = parts.iter().sum::<f64>() / parts.len() as f64;
     assert!(parts.len() == 42 && parts.iter().all(|part| *part > 0.3) && mean > 0.95, "{parts:?}");
@@ -76,7 +65,7 @@ fn small_charuco_boards_are_found() {
 fn tags_in_a_photo_match_annotations() {
     /// The annotations were made by another detector.
     const NEAR_PX: f64 = 1.5;
-    let Some(folder) = folder("apriltag") else { return };
+    let Some(folder) = test_support::data_folder("apriltag") else { return };
     let photo = image::open(folder.join("33369213973_9d9bb4cc96_c.jpg")).unwrap().to_luma8();
     let annotations = std::fs::read_to_string(folder.join("33369213973_9d9bb4cc96_c.txt")).unwrap();
     let corner = |text: &str| {

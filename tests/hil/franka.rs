@@ -4,25 +4,20 @@
 
 #![cfg(target_os = "linux")]
 
-#[path = "../common/stalls.rs"]
-mod stalls;
-
 use drivers::Arm;
 use drivers::franka::emulated::{EmulatedRobot, JointSimulator, Joints, Limits, RobotConfig};
 use drivers::franka::{ArmConfig, ContactConfig, FciVersion, FrankaArm, MotionStatistics, MovableFrankaArm, N_JOINTS};
 use drivers::motion::{JointTarget, Motion, MotionConfig, MotionLimits, MovableArm, OnLoss};
 use kinematics::{Chain, Transform};
 use parking_lot::Mutex;
-use stalls::Stalls;
 use std::fs;
 use std::io::Write;
 use std::net::{Ipv4Addr, SocketAddr, TcpListener};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
+use test_support::Stalls;
 
-/// If set to `demand`, the tests fail instead of being skipped on a machine that cannot run them. `.ci/run` sets it.
-const REQUIRE_HIL_VARIABLE: &str = "FIELDRIG_HIL";
 /// Timeout for steps that are slow on a busy machine.
 const TEST_TIMEOUT: Duration = Duration::from_secs(60);
 const URDF: &str = include_str!("../../rigs/robots/panda.urdf");
@@ -270,11 +265,8 @@ fn report(text: &str) {
 /// Python of the virtual environment. Returns `None` and prints the reason if it cannot be created.
 fn environment() -> Option<PathBuf> {
     if let Err(reason) = make_environment() {
-        assert!(
-            !std::env::var(REQUIRE_HIL_VARIABLE).is_ok_and(|value| value == "demand"),
-            "{REQUIRE_HIL_VARIABLE}=demand, but {reason}"
-        );
-        report(&format!("skipped: {reason}\n"));
+        assert!(!test_support::is_demanded(), "{reason}");
+        test_support::skip(reason);
         return None;
     }
     Some(folder().join("bin/python"))

@@ -16,8 +16,7 @@ pub(crate) const PROGRAM: &str = "/usr/bin/qemu-system-x86_64";
 /// The `ip` of busybox does not support bit rates.
 pub(crate) const IP: &str = "/usr/sbin/ip";
 
-/// First process of the kernel. It ends QEMU by a restart (`-no-reboot`), because a kernel without ACPI cannot switch the
-/// machine off.
+/// First process in the root folder. It ends QEMU by a restart (`-no-reboot`).
 const INIT: &str = r#"#!/bin/busybox sh
 bb=/bin/busybox
 $bb mount -t proc proc /proc
@@ -50,7 +49,8 @@ pub(crate) fn install_root(root: &Path) {
     write_script(&root.join("bin/sudo"), SUDO);
 }
 
-/// Boots the machine, waits until it ends, and returns the console output.
+/// Boots the machine, waits until it ends, and returns the console output. `kernel` is the folder of
+/// `debian-kernel.sh`.
 pub(crate) fn boot(kernel: &Path, root: &Path) -> String {
     let mut command = Command::new(PROGRAM);
     command
@@ -61,12 +61,10 @@ pub(crate) fn boot(kernel: &Path, root: &Path) -> String {
         .arg(format!("local,id=root,path={},security_model=none,readonly=on", root.display()))
         .args(["-device", "virtio-9p-pci,fsdev=root,mount_tag=root"])
         .arg("-kernel")
-        .arg(kernel)
-        .arg("-append")
-        .arg(
-            "console=ttyS0 root=root rootfstype=9p rootflags=trans=virtio,version=9p2000.L,cache=loose,msize=262144 \
-             ro init=/init quiet panic=-1 no_timer_check",
-        )
+        .arg(kernel.join("vmlinuz"))
+        .arg("-initrd")
+        .arg(kernel.join("initrd"))
+        .args(["-append", "console=ttyS0 quiet panic=-1 no_timer_check"])
         .stdin(Stdio::piped());
     run(&mut command, |machine, line| {
         if let Some((_, request)) = line.split_once(INJECT) {

@@ -1,7 +1,7 @@
 //! Tests of an emulated mobile arm inside the virtual kernel: motors of four families on one CAN bus, a base that sends
 //! datagrams, and a camera as a file. The production binary reads the arm and then moves it.
 
-#[path = "../wire/compare.rs"]
+#[path = "../program/wire/compare.rs"]
 mod compare;
 
 use std::io::{BufRead, BufReader};

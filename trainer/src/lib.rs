@@ -43,9 +43,6 @@ pub mod spherical_harmonics;
 pub mod splat;
 mod submits;
 #[cfg(test)]
-#[path = "../../tests/common/test_data.rs"]
-mod test_data;
-#[cfg(test)]
 mod test_scenes;
 
 pub mod atomic_file;

@@ -389,15 +389,8 @@ fn offsets_of_inner_joints_are_found_and_those_of_outer_joints_are_not_observabl
 
 /// Poses of the test data. `None` if they are absent.
 fn recorded() -> Option<Vec<HandEyeSample>> {
-    let data = std::env::var("FIELDRIG_TEST_DATA").map_or_else(
-        |_| std::path::PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/../../shared/data")),
-        std::path::PathBuf::from,
-    );
-    let folder = data.join("handeye/franka_9c23a7d/data/captured-data");
-    let Ok(entries) = folder.read_dir() else {
-        eprintln!("skipped: no test data at {}", folder.display());
-        return None;
-    };
+    let folder = test_support::data_folder("handeye/franka_9c23a7d/data/captured-data")?;
+    let entries = folder.read_dir().unwrap();
     let mut folders: Vec<_> = entries.map(|entry| entry.unwrap().path()).collect();
     folders.sort();
     fn numbers(value: &serde_json::Value) -> Vec<f64> {

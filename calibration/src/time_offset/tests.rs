@@ -6,7 +6,6 @@ use crate::hand_eye::Refusal;
 use kinematics::Transform;
 use kinematics::random::Random;
 use nalgebra::Vector3;
-use std::path::PathBuf;
 
 /// A smooth motion with frequencies up to 1 Hz.
 struct Motion {
@@ -140,13 +139,8 @@ fn invalid_streams_are_rejected() {
 
 /// Reads rows `t,x,y,z,qx,qy,qz,qw` of the test data. `None` if the data are absent.
 fn recorded(name: &str) -> Option<Vec<PoseSample>> {
-    let data = std::env::var("FIELDRIG_TEST_DATA")
-        .map_or_else(|_| PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/../../shared/data")), PathBuf::from);
-    let path = data.join("handeye").join(name);
-    let Ok(text) = std::fs::read_to_string(&path) else {
-        eprintln!("skipped: no test data at {}", path.display());
-        return None;
-    };
+    let path = test_support::data_folder(&format!("handeye/{name}"))?;
+    let text = std::fs::read_to_string(path).unwrap();
     let row = |line: &str| {
         let v: Vec<f64> = line.split(',').map(|value| value.trim().parse().unwrap()).collect();
         let rotation = nalgebra::UnitQuaternion::from_quaternion(nalgebra::Quaternion::new(v[7], v[4], v[5], v[6]));

@@ -1,7 +1,6 @@
 //! Loading dataset folders as keyframes.
 
 use super::*;
-use crate::test_data;
 use image::{GrayImage, Luma, RgbImage};
 use serde_json::{Value, json};
 use std::path::Path;
@@ -29,7 +28,7 @@ fn load_at(folder: &Path, scale_frac: f64) -> crate::Result<LoadedDataset> {
 
 #[test]
 fn fox_becomes_undistorted_keyframes() {
-    let Some(folder) = test_data::folder("fox") else { return };
+    let Some(folder) = test_support::data_folder("fox") else { return };
     let max_done = AtomicUsize::new(0);
     let dataset = drivers::dataset::read(&folder).unwrap();
     let on_progress = |n_done| _ = max_done.fetch_max(n_done, Ordering::Relaxed);
@@ -46,7 +45,7 @@ fn fox_becomes_undistorted_keyframes() {
 
 #[test]
 fn redkitchen_keeps_its_depth() {
-    let Some(folder) = test_data::folder("redkitchen") else { return };
+    let Some(folder) = test_support::data_folder("redkitchen") else { return };
     let loaded = load_at(&folder, 0.5).unwrap();
     let depth = loaded.keyframes[3].depth.as_ref().unwrap();
     assert_eq!((loaded.keyframes[3].size_px, depth.size_px), ([320, 240], [640, 480]));

@@ -1,7 +1,6 @@
 //! Tests with real dataset folders and with small folders that the tests create.
 
 use super::*;
-use crate::test_data;
 use image::{ExtendedColorType, GrayImage, Luma, RgbImage};
 use kinematics::{Lens, Stamp};
 use nalgebra::{Point3, Vector3};
@@ -45,7 +44,7 @@ fn read_error(folder: &tempfile::TempDir) -> String {
 
 #[test]
 fn fox_is_read_without_missing_photos() {
-    let Some(folder) = test_data::folder("fox") else { return };
+    let Some(folder) = test_support::data_folder("fox") else { return };
     let dataset = read(&folder).unwrap();
     assert_eq!((dataset.images.len(), dataset.n_missing, dataset.n_unusable), (50, 17, 0));
     assert!(dataset.notes[0].starts_with("17 images are missing: "), "{:?}", dataset.notes);
@@ -67,7 +66,7 @@ fn fox_is_read_without_missing_photos() {
 
 #[test]
 fn redkitchen_has_depth_in_meters() {
-    let Some(folder) = test_data::folder("redkitchen") else { return };
+    let Some(folder) = test_support::data_folder("redkitchen") else { return };
     let dataset = read(&folder).unwrap();
     assert_eq!((dataset.images.len(), dataset.n_missing, dataset.notes.len()), (50, 0, 0));
     let depth = dataset.images[10].load().unwrap().depth.unwrap();

@@ -1,19 +1,16 @@
 //! Tests over loopback sockets: our driver, and franka-rs as a client that moves, against emulated robots.
 
-#[path = "../../../tests/common/stalls.rs"]
-mod stalls;
-
 use super::emulated::{CommandedJoints, EmulatedRobot, JointSimulator, Joints, Limits, RobotConfig};
 use super::{ArmConfig, FciVersion, FrankaArm, N_JOINTS};
 use crate::{Arm, Error};
 use franka::{ControllerMode, FrankaError, JointPositions, MoveStatus, RealtimeConfig, Robot, RobotMode};
 use kinematics::random::Random;
 use kinematics::{Chain, Stamp, Transform};
-use stalls::Stalls;
 use std::io::{Read, Write};
 use std::net::{SocketAddr, TcpStream, UdpSocket};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
+use test_support::Stalls;
 
 const URDF: &str = include_str!("../../../kinematics/tests/data/panda.urdf");
 pub(super) const FREE_PORT: &str = "127.0.0.1:0";

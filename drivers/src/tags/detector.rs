@@ -172,7 +172,6 @@ fn detect(detector: &mut Detector, image: &Image) -> Result<TagDetections, Error
 mod tests {
     use super::*;
     use crate::PixelFormat;
-    use crate::test_data;
     use kinematics::random::Random;
 
     fn image(size_px: [u32; 2], format: PixelFormat, data: Vec<u8>) -> Image {
@@ -194,7 +193,7 @@ mod tests {
     fn tags_in_photo_match_annotations() {
         /// The annotations were made by an earlier version of the detector with other settings.
         const NEAR_PX: f64 = 1.5;
-        let Some(folder) = test_data::folder("apriltag") else { return };
+        let Some(folder) = test_support::data_folder("apriltag") else { return };
         let read = |name: &str| std::fs::read(folder.join(name)).unwrap();
         let photo = image([799, 533], PixelFormat::Jpeg, read("33369213973_9d9bb4cc96_c.jpg"));
         let annotated = parse_annotations(&String::from_utf8(read("33369213973_9d9bb4cc96_c.txt")).unwrap());

@@ -304,7 +304,7 @@ mod tests {
     fn abi_matches_kernel_header() {
         let header = std::path::Path::new("/usr/include/linux/videodev2.h");
         if !header.exists() {
-            eprintln!("skipped: {header:?} does not exist");
+            test_support::skip(format_args!("{header:?} does not exist"));
             return;
         }
         macro_rules! rows {

@@ -41,7 +41,7 @@ fn agrees(what: &str, got: f64, expected: f64, tolerance: f64) -> bool {
 
 #[test]
 fn metrics_agree_with_the_oracle() {
-    let Some(folder) = crate::test_data::folder("metrics") else { return };
+    let Some(folder) = test_support::data_folder("metrics") else { return };
     #[cfg(feature = "lpips")]
     let lpips = Lpips::load(&folder.join("lpips_squeeze_v0.1.safetensors")).unwrap();
     let rows = json(&folder.join("oracle_metrics.json"));
@@ -65,7 +65,7 @@ fn metrics_agree_with_the_oracle() {
 #[cfg(feature = "lpips")]
 #[test]
 fn lpips_matches_the_oracle_pair_by_pair() {
-    let Some(folder) = crate::test_data::folder("metrics") else { return };
+    let Some(folder) = test_support::data_folder("metrics") else { return };
     let lpips = Lpips::load(&folder.join("lpips_squeeze_v0.1.safetensors")).unwrap();
     for (names, row) in json(&folder.join("oracle_lpips_squeeze_ex.json")).as_object().unwrap() {
         let (a, b) = names.split_once('|').unwrap();
@@ -78,7 +78,7 @@ fn lpips_matches_the_oracle_pair_by_pair() {
 
 #[test]
 fn slightly_brighter_picture_does_not_agree() {
-    let Some(folder) = crate::test_data::folder("metrics") else { return };
+    let Some(folder) = test_support::data_folder("metrics") else { return };
     let (a, b) = (picture(&folder, "fox_a.png"), picture(&folder, "fox_b_noise.png"));
     // One level brighter everywhere: hardly visible, but every metric must detect it.
     let brighter: Vec<u8> = b.rgba.iter().map(|&value| value.saturating_add(1)).collect();
@@ -97,7 +97,7 @@ fn slightly_brighter_picture_does_not_agree() {
 #[cfg(feature = "lpips")]
 #[test]
 fn lpips_ignores_masked_pixels_and_rejects_small_pictures() {
-    let Some(folder) = crate::test_data::folder("metrics") else { return };
+    let Some(folder) = test_support::data_folder("metrics") else { return };
     let lpips = Lpips::load(&folder.join("lpips_squeeze_v0.1.safetensors")).unwrap();
     let (a, mut b) = (picture(&folder, "fox_a.png"), picture(&folder, "fox_a.png"));
     for pixel in b.rgba.chunks_exact_mut(4).take(5000) {

@@ -84,7 +84,7 @@ fn broken_files_are_rejected_with_the_reason() {
 
 #[test]
 fn packed_files_of_another_program_are_read() {
-    let Some(folder) = crate::test_data::folder("splats") else { return };
+    let Some(folder) = test_support::data_folder("splats") else { return };
     let small = read(&folder.join("test.ply")).unwrap();
     assert_eq!((small.n_splats(), small.sh_degree), (64, 3));
     // The bounds of the file's only chunk.

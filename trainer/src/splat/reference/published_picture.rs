@@ -13,7 +13,7 @@ const REL: f64 = 1e-5;
 
 #[test]
 fn render_matches_a_published_picture() {
-    let Some(folder) = crate::test_data::folder("splats") else { return };
+    let Some(folder) = test_support::data_folder("splats") else { return };
     let bytes = std::fs::read(folder.join("brush_tiny_case.safetensors")).expect("the test data contain this file");
     let tensors = SafeTensors::deserialize(&bytes).expect("a valid file");
     let floats = |name: &str| -> Vec<f64> {

@@ -219,7 +219,7 @@ fn unsupported_values_are_rejected() {
 
 #[test]
 fn files_of_another_program_are_read() {
-    let Some(folder) = crate::test_data::folder("splats") else { return };
+    let Some(folder) = test_support::data_folder("splats") else { return };
     for name in ["minimal-v2.spz", "minimal-v3.spz"] {
         let splats = read(&folder.join(name)).unwrap();
         assert_eq!((splats.n_splats(), splats.sh_degree), (4, 0), "{name}");

@@ -1,0 +1,6 @@
+//! Tests of the simulated rigs.
+
+mod common;
+mod live;
+mod mobile;
+mod rig;

@@ -1,0 +1,114 @@
+//! Checks the dependencies between the crates of the workspace, as reported by `cargo metadata`, against
+//! ARCHITECTURE.md.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::process::Command;
+
+/// Every crate, and the workspace crates that it may depend on.
+const ALLOWED: [(&str, &[&str]); 13] = [
+    ("kinematics", &[]),
+    ("keyframe", &["kinematics"]),
+    ("calibration", &["keyframe", "kinematics"]),
+    ("drivers", &["kinematics"]),
+    ("sim", &["drivers", "kinematics", "targets"]),
+    ("targets", &["kinematics"]),
+    ("test-support", &[]),
+    ("capture", &["calibration", "drivers", "keyframe", "kinematics", "sim"]),
+    ("trainer", &["calibration", "keyframe", "kinematics"]),
+    ("viz", &["keyframe", "kinematics", "trainer"]),
+    ("session", &["calibration", "capture", "drivers", "keyframe", "kinematics", "trainer", "viz"]),
+    ("bench", &["calibration", "capture", "keyframe", "kinematics", "session", "trainer"]),
+    (
+        "fieldrig",
+        &[
+            "bench",
+            "calibration",
+            "capture",
+            "drivers",
+            "keyframe",
+            "kinematics",
+            "session",
+            "sim",
+            "targets",
+            "trainer",
+            "viz",
+        ],
+    ),
+];
+
+/// Crates that only `fieldrig` may use, because only it prints and parses command lines.
+const BINARY_ONLY: [&str; 5] = ["anyhow", "clap", "ctrlc", "env_logger", "indicatif"];
+
+/// Direct dependencies by package, without dev-dependencies.
+type Dependencies = BTreeMap<String, BTreeSet<String>>;
+
+fn dependencies() -> Dependencies {
+    let output = Command::new(env!("CARGO"))
+        .args(["metadata", "--format-version", "1", "--no-deps", "--offline"])
+        .current_dir(env!("CARGO_MANIFEST_DIR"))
+        .output()
+        .expect("cargo runs");
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let metadata: serde_json::Value = serde_json::from_slice(&output.stdout).expect("cargo prints JSON");
+    let text = |value: &serde_json::Value| value.as_str().expect("a string").to_owned();
+    metadata["packages"]
+        .as_array()
+        .expect("packages")
+        .iter()
+        .map(|package| {
+            let direct = package["dependencies"].as_array().expect("dependencies").iter();
+            let shipped = direct.filter(|dependency| dependency["kind"] != "dev");
+            (text(&package["name"]), shipped.map(|dependency| text(&dependency["name"])).collect())
+        })
+        .collect()
+}
+
+/// Every forbidden dependency, and every crate without a rule.
+fn violations(dependencies: &Dependencies) -> Vec<String> {
+    let mut violations_found = Vec::new();
+    let workspace_crates: BTreeSet<&str> = dependencies.keys().map(String::as_str).collect();
+    for (package, direct) in dependencies {
+        let Some((_, allowed)) = ALLOWED.iter().find(|(name, _)| name == package) else {
+            violations_found.push(format!("{package} has no rule in this test"));
+            continue;
+        };
+        for dependency in direct {
+            if workspace_crates.contains(dependency.as_str()) && !allowed.contains(&dependency.as_str()) {
+                violations_found.push(format!("{package} -> {dependency}"));
+            }
+            if package != "fieldrig" && BINARY_ONLY.contains(&dependency.as_str()) {
+                violations_found.push(format!("{package} -> {dependency}, which only fieldrig may use"));
+            }
+        }
+    }
+    violations_found
+}
+
+#[test]
+fn dependencies_follow_architecture() {
+    let dependencies = dependencies();
+    assert_eq!(dependencies.len(), ALLOWED.len(), "crates: {:?}", dependencies.keys());
+    assert_eq!(violations(&dependencies), Vec::<String>::new());
+}
+
+#[test]
+fn forbidden_dependency_is_detected() {
+    let mut dependencies = dependencies();
+    dependencies.get_mut("trainer").expect("trainer").extend(["drivers".to_owned(), "anyhow".to_owned()]);
+    dependencies.insert("shortcut".to_owned(), BTreeSet::new());
+    let expected =
+        ["shortcut has no rule in this test", "trainer -> anyhow, which only fieldrig may use", "trainer -> drivers"];
+    assert_eq!(violations(&dependencies), expected);
+}
+
+/// Without an entry, a crate would be compiled like a dependency: slowly, and without line numbers in backtraces.
+#[test]
+fn every_crate_has_a_development_profile() {
+    let manifest = std::fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/Cargo.toml")).expect("a manifest");
+    let manifest: toml::Table = manifest.parse().expect("TOML");
+    let profiles = manifest["profile"]["dev"]["package"].as_table().expect("a table");
+    for (name, _) in ALLOWED {
+        let debug = profiles.get(name).and_then(|profile| profile.get("debug")?.as_str());
+        assert_eq!(debug, Some("line-tables-only"), "the profile of {name}");
+    }
+}

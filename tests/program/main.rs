@@ -1,0 +1,36 @@
+//! Tests of the whole program `fieldrig` in one program, so that they are linked once and fill all processors.
+
+mod arrows;
+mod bench;
+mod calibrate;
+mod calibrate_eye_to_hand;
+mod calibrate_mistakes;
+mod calibrate_page;
+mod calibrate_scan;
+mod cli;
+mod command;
+mod depth_from;
+mod edits;
+mod end_to_end;
+mod file_cycles;
+mod fk;
+mod gpu_loss;
+mod metrics_export;
+mod output;
+mod page_replay;
+#[cfg(feature = "sim")]
+mod page_server;
+mod photos;
+#[cfg(feature = "realsense")]
+mod realsense;
+mod resume;
+mod robot_silhouette;
+#[cfg(feature = "sim")]
+mod small_rig;
+mod together;
+mod view;
+mod wall;
+#[cfg(all(feature = "realsense", feature = "sim"))]
+mod wire;
+#[cfg(feature = "sim")]
+mod wire_session;

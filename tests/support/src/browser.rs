@@ -1,0 +1,250 @@
+//! Headless Chromium, driven over its debugging protocol.
+//!
+//! All functions panic if the browser does not answer.
+
+use serde_json::{Value, json};
+use std::io::{BufRead, BufReader};
+use std::net::TcpStream;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
+use tungstenite::{Message, WebSocket};
+
+/// Far more than a browser needs on two busy cores.
+const TIMEOUT: Duration = Duration::from_secs(60);
+
+/// A script for [`Browser::open_with`]: WebGL calls draw nothing, because drawing on the CPU takes most of the time.
+pub const NO_DRAWING: &str = include_str!("no_drawing.js");
+
+/// A running browser with one page.
+pub struct Browser {
+    process: Child,
+    socket: WebSocket<TcpStream>,
+    session: String,
+    n_calls: u64,
+}
+
+/// Path of a browser for tests of the page. If Chromium or the bundled page is missing, reports the calling test as skipped
+/// and returns `None`.
+///
+/// # Panics
+/// Panics instead of skipping the test if [tests are demanded](crate::is_demanded).
+pub fn browser_for_page() -> Option<PathBuf> {
+    let browser = chromium().filter(|_| bundle().join("app.js").is_file());
+    if browser.is_none() {
+        let reason = "Chromium or the bundled page is missing (scripts/install-packages.sh browser; make web)";
+        assert!(!crate::is_demanded(), "{reason}");
+        crate::skip(reason);
+    }
+    browser
+}
+
+/// Folder of the bundled page.
+pub fn bundle() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../../viz/web/dist")
+}
+
+/// Path of Chromium, if it is installed.
+fn chromium() -> Option<PathBuf> {
+    let names = ["chromium", "chromium-browser", "google-chrome"];
+    let folders: Vec<PathBuf> = std::env::split_paths(&std::env::var_os("PATH")?).collect();
+    let paths = names.iter().flat_map(|name| folders.iter().map(move |folder| folder.join(name)));
+    paths.into_iter().find(|path| path.is_file())
+}
+
+/// A task of the main thread.
+#[derive(Clone, Copy, Debug)]
+pub struct Task {
+    /// Duration, milliseconds.
+    pub millis: f64,
+    /// CPU time, milliseconds: without the time for which other programs used the core.
+    pub cpu_millis: f64,
+}
+
+impl Browser {
+    /// Opens a page of this size in CSS pixels; the profile folder must be empty.
+    pub fn open(program: &Path, profile: &Path, url: &str, size_px: [u32; 2]) -> Self {
+        Self::open_with(program, profile, url, size_px, "")
+    }
+
+    /// [`Browser::open`]; runs a script before the page's own scripts.
+    pub fn open_with(program: &Path, profile: &Path, url: &str, [width, height]: [u32; 2], script: &str) -> Self {
+        let mut process = Command::new(program)
+            .args(["--headless", "--no-sandbox", "--disable-quic", "--no-first-run", "--ignore-certificate-errors"])
+            .args(["--disable-background-networking", "--disable-component-update", "--disable-sync"])
+            .args(["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--hide-scrollbars"])
+            .args(["--remote-debugging-port=0", "--force-device-scale-factor=1"])
+            .arg(format!("--window-size={width},{height}"))
+            .arg(format!("--user-data-dir={}", profile.display()))
+            .arg("about:blank")
+            .stderr(Stdio::piped())
+            .stdout(Stdio::null())
+            .spawn()
+            .expect("chromium starts");
+        let mut lines = BufReader::new(process.stderr.take().expect("stderr is piped")).lines();
+        let address = lines
+            .by_ref()
+            .map_while(Result::ok)
+            .find_map(|line| line.strip_prefix("DevTools listening on ").map(str::to_owned))
+            .expect("chromium prints its debugging address");
+        // The pipe is drained, because the browser would block once it is full.
+        std::thread::spawn(move || lines.map_while(Result::ok).for_each(drop));
+        let host = address.trim_start_matches("ws://").split('/').next().expect("a host");
+        let stream = TcpStream::connect(host).expect("chromium listens");
+        stream.set_read_timeout(Some(TIMEOUT)).expect("a timeout");
+        let (socket, _) = tungstenite::client(&address, stream).expect("a WebSocket");
+        let mut browser = Self { process, socket, session: String::new(), n_calls: 0 };
+        let target = browser.call("Target.createTarget", json!({"url": "about:blank"}));
+        let attached = browser.call("Target.attachToTarget", json!({"targetId": target["targetId"], "flatten": true}));
+        browser.session = attached["sessionId"].as_str().expect("a session").to_owned();
+        browser.resize([width, height]);
+        browser.call("Page.enable", json!({}));
+        browser.call("Page.addScriptToEvaluateOnNewDocument", json!({"source": script}));
+        browser.call("Page.navigate", json!({"url": url}));
+        browser
+    }
+
+    /// Changes the window's size in CSS pixels.
+    pub fn resize(&mut self, [width, height]: [u32; 2]) {
+        let size = json!({"width": width, "height": height, "deviceScaleFactor": 1, "mobile": false});
+        self.call("Emulation.setDeviceMetricsOverride", size);
+    }
+
+    /// Calls a method of the debugging protocol.
+    pub fn call(&mut self, method: &str, params: Value) -> Value {
+        self.n_calls += 1;
+        let mut message = json!({"id": self.n_calls, "method": method, "params": params});
+        if !self.session.is_empty() {
+            message["sessionId"] = json!(self.session);
+        }
+        self.socket.send(Message::text(message.to_string())).expect("sent");
+        loop {
+            let Message::Text(text) = self.socket.read().expect("chromium answers") else { continue };
+            let answer: Value = serde_json::from_str(&text).expect("JSON");
+            if answer["id"] == json!(self.n_calls) {
+                assert!(answer.get("error").is_none(), "{method}: {answer}");
+                return answer["result"].clone();
+            }
+        }
+    }
+
+    /// Value of a JavaScript expression.
+    pub fn evaluate(&mut self, expression: &str) -> Value {
+        let result = self.call("Runtime.evaluate", json!({"expression": expression, "returnByValue": true}));
+        assert!(result.get("exceptionDetails").is_none(), "{expression}: {result}");
+        result["result"]["value"].clone()
+    }
+
+    /// Waits until all events so far are on screen.
+    pub fn next_frame(&mut self) {
+        let frames = "new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(() => done(1))))";
+        self.call("Runtime.evaluate", json!({"expression": frames, "awaitPromise": true}));
+    }
+
+    /// Text of the element with this id.
+    pub fn text(&mut self, id: &str) -> String {
+        let text = self.evaluate(&format!("document.getElementById('{id}')?.textContent ?? ''"));
+        text.as_str().unwrap_or_default().to_owned()
+    }
+
+    /// Clicks the element with this id.
+    pub fn click(&mut self, id: &str) {
+        self.evaluate(&format!("document.getElementById('{id}').click()"));
+    }
+
+    /// Moves the mouse; `kind` is `mousePressed`, `mouseMoved` or `mouseReleased`.
+    pub fn mouse(&mut self, kind: &str, [x, y]: [i32; 2]) {
+        let event = json!({"type": kind, "x": x, "y": y, "button": "left", "buttons": 1, "clickCount": 1});
+        self.call("Input.dispatchMouseEvent", event);
+    }
+
+    /// The tasks of the page's main thread within this time.
+    pub fn trace_tasks(&mut self, duration: Duration) -> Vec<Task> {
+        let session = std::mem::take(&mut self.session); // Tracing belongs to the browser, not to the page.
+        self.call("Tracing.start", json!({"traceConfig": {"includedCategories": ["toplevel"]}}));
+        std::thread::sleep(duration);
+        self.call("Tracing.end", json!({}));
+        let mut events: Vec<Value> = Vec::new();
+        loop {
+            let Message::Text(text) = self.socket.read().expect("chromium answers") else { continue };
+            let mut message: Value = serde_json::from_str(&text).expect("JSON");
+            match message["method"].as_str() {
+                Some("Tracing.dataCollected") => {
+                    events.append(message["params"]["value"].as_array_mut().expect("events"));
+                }
+                Some("Tracing.tracingComplete") => break,
+                _ => {}
+            }
+        }
+        self.session = session;
+        let is_main = |event: &&Value| event["name"] == "thread_name" && event["args"]["name"] == "CrRendererMain";
+        let main_threads: Vec<_> = events.iter().filter(is_main).map(|event| (&event["pid"], &event["tid"])).collect();
+        let is_task = |event: &&Value| {
+            event["name"] == "ThreadControllerImpl::RunTask" && main_threads.contains(&(&event["pid"], &event["tid"]))
+        };
+        let task = |event: &Value| {
+            Some(Task { millis: event["dur"].as_f64()? * 1e-3, cpu_millis: event["tdur"].as_f64()? * 1e-3 })
+        };
+        events.iter().filter(is_task).filter_map(task).collect()
+    }
+
+    /// Screenshot of the page as PNG.
+    pub fn screenshot(&mut self) -> Vec<u8> {
+        let shot = self.call("Page.captureScreenshot", json!({"format": "png"}));
+        bytes_from_base64(shot["data"].as_str().expect("base64"))
+    }
+}
+
+impl Drop for Browser {
+    fn drop(&mut self) {
+        // A browser that was asked to close also ends its own child processes.
+        self.session.clear();
+        let close = json!({"id": 0, "method": "Browser.close"});
+        let asked = self.socket.send(Message::text(close.to_string())).is_ok();
+        if !asked && self.process.kill().is_err() {
+            return;
+        }
+        let _ = self.process.wait();
+    }
+}
+
+fn bytes_from_base64(text: &str) -> Vec<u8> {
+    let sextet = |symbol: u8| match symbol {
+        b'A'..=b'Z' => u32::from(symbol - b'A'),
+        b'a'..=b'z' => u32::from(symbol - b'a') + 26,
+        b'0'..=b'9' => u32::from(symbol - b'0') + 52,
+        b'+' => 62,
+        _ => 63,
+    };
+    let symbols: Vec<u8> = text.bytes().filter(|symbol| *symbol != b'=').collect();
+    symbols
+        .chunks(4)
+        .flat_map(|group| {
+            let bits = group.iter().fold(0, |bits, symbol| bits << 6 | sextet(*symbol)) << (6 * (4 - group.len()));
+            bits.to_be_bytes()[1..group.len()].to_vec()
+        })
+        .collect()
+}
+
+/// Waits until the page is in a state.
+pub fn wait_for(browser: &mut Browser, what: &str, mut is_there: impl FnMut(&mut Browser) -> bool) {
+    let started = Instant::now();
+    while !is_there(browser) {
+        assert!(started.elapsed() < TIMEOUT, "timed out waiting for {what}");
+        std::thread::sleep(Duration::from_millis(50));
+    }
+}
+
+/// Left, top, width and height of the view in the window, pixels.
+pub fn canvas_bounds(browser: &mut Browser) -> [u32; 4] {
+    let bounds = browser.evaluate("(() => { const b = document.getElementById('canvas').getBoundingClientRect(); return [b.x, b.y, b.width, b.height].map(Math.round) })()");
+    [0, 1, 2, 3].map(|ix| bounds[ix].as_u64().and_then(|n| u32::try_from(n).ok()).expect("a bound"))
+}
+
+/// The part of the window that the view covers.
+pub fn canvas_shot(browser: &mut Browser) -> image::RgbImage {
+    browser.next_frame();
+    let [x, y, width, height] = canvas_bounds(browser);
+    let shot = image::load_from_memory_with_format(&browser.screenshot(), image::ImageFormat::Png).expect("a PNG");
+    shot.crop_imm(x, y, width, height).to_rgb8()
+}

@@ -1,0 +1,26 @@
+//! Tests of the server, the protocol and the page in one program, so that they are linked once and fill all processors.
+
+mod admission;
+mod analytic_scene;
+mod client;
+mod eye_page;
+#[cfg(feature = "foxglove")]
+mod foxglove;
+mod local_page;
+mod model_chunks;
+mod models;
+mod negotiation;
+mod page;
+mod page_latency;
+mod page_tasks;
+mod protocol;
+mod proxy;
+mod request_thread;
+mod robot;
+mod robot_page;
+mod shared;
+mod shared_page;
+mod shown_pictures;
+mod tls;
+mod unsupported_page;
+mod video_page;
