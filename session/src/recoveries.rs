@@ -76,3 +76,28 @@ fn restart_all(sessions: &mut [Session], open_gpu: OpenGpu) -> crate::Result<()>
     let gpu = open_gpu().context("cannot reopen the GPU")?;
     sessions.iter_mut().try_for_each(|session| session.restart_on(&gpu))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::sync::atomic::{AtomicU32, Ordering};
+    use trainer::gpu::GpuOptions;
+
+    static N_OPENED: AtomicU32 = AtomicU32::new(0);
+
+    fn open_and_count() -> crate::Result<Arc<Gpu>> {
+        N_OPENED.fetch_add(1, Ordering::Relaxed);
+        Ok(Gpu::open(&GpuOptions::default())?)
+    }
+
+    #[test]
+    fn only_gpu_errors_reopen_the_gpu() {
+        let mut recoveries = Recoveries::new(open_and_count);
+        let bug = trainer::Error::Internal("a buffer is missing".to_owned());
+        let error = recoveries.recover(&mut [], bug.into()).expect_err("the bug is reported");
+        assert!(error.to_string().contains("a buffer is missing"), "{error}");
+        assert_eq!((N_OPENED.load(Ordering::Relaxed), recoveries.n), (0, 0));
+        recoveries.recover(&mut [], trainer::Error::DeviceLost.into()).expect("the GPU is reopened");
+        assert_eq!((N_OPENED.load(Ordering::Relaxed), recoveries.n), (1, 1));
+    }
+}

@@ -588,7 +588,7 @@ fn next_live_alignment(n: usize) -> usize {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::gpu::GpuOptions;
+    use crate::gpu::testing::test_gpu;
     use crate::mean_color::MeanColor;
     use crate::model_options::ModelOptions;
     use crate::nerf::{NerfBudget, NerfModel, NerfOptions};
@@ -629,7 +629,7 @@ mod tests {
     fn models_get_corrected_cameras_and_resume_exactly() {
         /// Steps after the first one that follows the correction.
         const RESTARTED: u64 = 1;
-        let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+        let gpu = test_gpu();
         check_correction(&gpu, tsdf(&gpu), RESTARTED, TsdfModel::resume, TsdfModel::load);
         check_correction(&gpu, nerf(&gpu), ALIGNMENT_STEP + 1, NerfModel::resume, NerfModel::load);
         check_correction(
@@ -842,7 +842,7 @@ mod tests {
         let without_depth = |keyframe: &Arc<Keyframe>| Arc::new(Keyframe { depth: None, ..(**keyframe).clone() });
         let keyframes: Vec<_> = capture(&miscalibration).iter().map(without_depth).collect();
         let choice = CameraRefinement::Try(vec![ParamSet::EXTRINSICS]);
-        let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+        let gpu = test_gpu();
         let splats = SplatTrainer::new(gpu, ModelOptions::default()).unwrap();
         let mut model = Aligned::new(splats, choice, true, 4 * ALIGNMENT_STEP);
         keyframes.iter().for_each(|keyframe| model.push(keyframe.clone()).unwrap());
@@ -858,7 +858,7 @@ mod tests {
 
     #[test]
     fn empty_model_is_idle_and_failed_alignment_does_not_stop_training() {
-        let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+        let gpu = test_gpu();
         check_training_continues(tsdf(&gpu));
         check_training_continues(nerf(&gpu));
         check_training_continues(MeanColor::new(ModelOptions::default()));

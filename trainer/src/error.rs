@@ -45,9 +45,13 @@ pub enum Error {
         /// Requested size, bytes.
         bytes: u64,
     },
-    /// The GPU rejected a command, because of a bug in this program or in the driver.
-    #[error("the GPU rejected a command: {0}")]
-    Rejected(String),
+    /// The driver failed to execute a valid command.
+    #[error("the GPU's driver failed: {0}")]
+    DriverFailed(String),
+    /// A bug in this program: its state contradicts itself, or it gave the GPU an invalid command. Another device would
+    /// not help, so this is not a [GPU error](Self::is_gpu_error).
+    #[error("internal error: {0}; this is a bug in fieldrig, please report it")]
+    Internal(String),
     /// A buffer exceeds the adapter's limit.
     #[error(
         "buffer {label}: {bytes} bytes are more than this GPU can bind ({limit_bytes} bytes); lower --max-splats, --max-bytes or the image size"
@@ -252,9 +256,14 @@ pub enum Error {
 }
 
 impl Error {
+    /// An [`Error::Internal`]; `what` is a clause without a period.
+    pub(crate) fn internal(what: &str) -> Self {
+        Self::Internal(what.to_owned())
+    }
+
     /// Whether the GPU caused the error. If so, the same work may succeed on another device.
     pub fn is_gpu_error(&self) -> bool {
-        matches!(self, Self::DeviceLost | Self::OutOfMemory { .. } | Self::Rejected(_))
+        matches!(self, Self::DeviceLost | Self::OutOfMemory { .. } | Self::DriverFailed(_))
     }
 
     /// Whether a buffer of the requested size could not be allocated.

@@ -1,5 +1,6 @@
 //! The device that all kernels and viewers share, and its buffers.
 
+use super::pipeline_cache::PipelineCache;
 use super::{GpuOptions, Optional};
 use crate::Error;
 use parking_lot::{Mutex, RwLock};
@@ -33,6 +34,7 @@ pub struct Gpu {
     live: Arc<LiveBuffers>,
     peak_bytes: AtomicU64,
     next_id: AtomicU64,
+    pub(super) pipelines: PipelineCache,
     /// Read-back buffers for reuse, the oldest first.
     idle_staging: Mutex<VecDeque<wgpu::Buffer>>,
     /// Read-locked while memory is mapped or copied, because destroying the device unmaps it.
@@ -76,16 +78,18 @@ struct Health {
 #[derive(Debug)]
 enum Failure {
     OutOfMemory,
-    Rejected(String),
+    /// The driver failed to execute a valid command.
+    Driver(String),
+    /// A command was invalid.
+    Invalid(String),
 }
 
 impl Health {
     fn record_error(&self, error: wgpu::Error) {
         let failure = match error {
             wgpu::Error::OutOfMemory { .. } => Failure::OutOfMemory,
-            wgpu::Error::Validation { description, .. } | wgpu::Error::Internal { description, .. } => {
-                Failure::Rejected(description)
-            }
+            wgpu::Error::Internal { description, .. } => Failure::Driver(description),
+            wgpu::Error::Validation { description, .. } => Failure::Invalid(description),
         };
         self.failed.get_or_init(|| failure);
     }
@@ -194,6 +198,7 @@ impl Gpu {
             live: Arc::default(),
             peak_bytes: AtomicU64::new(0),
             next_id: AtomicU64::new(0),
+            pipelines: PipelineCache::default(),
             idle_staging: Mutex::default(),
             mapped: RwLock::default(),
         }))
@@ -259,12 +264,18 @@ impl Gpu {
         self.health.lost.get().is_some()
     }
 
-    /// Returns an error if the device was lost, ran out of memory or rejected a command since it was opened.
+    /// Returns an error if the device was lost, ran out of memory, failed or got an invalid command since it was opened.
     pub fn check(&self) -> Result<(), Error> {
-        match self.health.failed.get() {
+        let failed = self.health.failed.get();
+        if matches!(failed, Some(Failure::Invalid(_))) && !self.is_lost() {
+            // Commands for a lost device are invalid, too, and wgpu may report the loss only when it is polled.
+            let _ = std::panic::catch_unwind(AssertUnwindSafe(|| self.device.poll(wgpu::PollType::Poll)));
+        }
+        match failed {
             Some(Failure::OutOfMemory) => Err(Error::OutOfMemory { label: String::new(), bytes: 0 }),
             _ if self.is_lost() => Err(Error::DeviceLost),
-            Some(Failure::Rejected(message)) => Err(Error::Rejected(message.clone())),
+            Some(Failure::Driver(message)) => Err(Error::DriverFailed(message.clone())),
+            Some(Failure::Invalid(message)) => Err(Error::internal(message)),
             None => Ok(()),
         }
     }
@@ -440,6 +451,11 @@ impl Gpu {
         }
     }
 
+    /// The recorded failure of the device, or an internal error if it works.
+    pub(crate) fn failure_or(&self, internal: &str) -> Error {
+        self.check().err().unwrap_or_else(|| Error::internal(internal))
+    }
+
     /// The recorded failure, or [`Error::DeviceLost`] if there is none.
     fn failure(&self) -> Error {
         self.check().err().unwrap_or(Error::DeviceLost)
@@ -548,6 +564,24 @@ mod tests {
         assert_eq!(gpu.live_bytes_by_label(), BTreeMap::from([("kept".into(), kept.bytes())]));
         assert_eq!((gpu.live_bytes(), gpu.peak_bytes()), (64, 160));
         assert!(gpu.reserved_bytes().is_none_or(|bytes| bytes >= 64));
+    }
+
+    /// A bug must not look like a failing GPU, because a session would then restart on another device.
+    #[test]
+    fn invalid_commands_are_internal_errors_and_lost_devices_are_gpu_errors() {
+        let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+        let buffer = gpu.storage("short", 16).unwrap();
+        assert!(gpu.wait().is_ok());
+        gpu.clear(&buffer, 0, 32); // Beyond the end.
+        let error = gpu.wait().unwrap_err();
+        assert!(matches!(error, Error::Internal(_)) && !error.is_gpu_error(), "{error}");
+
+        let lost = Gpu::open(&GpuOptions::default()).unwrap();
+        let buffer = lost.storage("lost", 16).unwrap();
+        lost.lose();
+        let error = lost.read::<u32>(&buffer, 4).unwrap_err();
+        assert!(matches!(error, Error::DeviceLost) && error.is_gpu_error(), "{error}");
+        assert!(matches!(lost.failure_or("unused"), Error::DeviceLost));
     }
 
     #[test]

@@ -4,6 +4,7 @@ mod device;
 mod options;
 mod passes;
 mod pipeline;
+mod pipeline_cache;
 mod requirements;
 #[cfg(test)]
 pub(crate) mod testing;
@@ -13,6 +14,7 @@ pub use device::{Buffer, Gpu, PendingRead};
 pub use kinematics::{f32_of, f32s_of};
 pub use options::GpuOptions;
 pub use passes::{PassTiming, Passes};
-pub use pipeline::{Kernel, Pipeline};
+pub use pipeline::Kernel;
+pub use pipeline_cache::Pipeline;
 pub use requirements::Optional;
 pub use wgsl::{Source, reflect, resolve};

@@ -1,7 +1,7 @@
 //! Options for opening a GPU.
 
 /// Which adapter to open, and how much of it to use.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct GpuOptions {
     /// Whether optional features of the adapter may be used.
     pub optional_features: bool,

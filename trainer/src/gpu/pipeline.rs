@@ -1,9 +1,12 @@
 //! Compute pipelines whose bindings are found by their names in the WGSL.
 
+use super::pipeline_cache::Key;
 use super::wgsl::{Access, Binding};
-use super::{Gpu, Source, reflect, resolve, wgsl};
+use super::{Gpu, Pipeline, Source, reflect, resolve, wgsl};
 use crate::Error;
 use rayon::prelude::*;
+use std::borrow::Cow;
+use std::sync::Arc;
 
 /// A kernel: its WGSL file and the files it may import.
 #[derive(Clone, Copy, Debug)]
@@ -14,30 +17,26 @@ pub struct Kernel {
     pub shared: &'static [Source],
 }
 
-/// A compiled kernel.
-#[derive(Debug)]
-pub struct Pipeline {
-    pub(super) id: u64,
-    pub(super) name: &'static str,
-    pub(super) raw: wgpu::ComputePipeline,
-    pub(super) layout: wgpu::BindGroupLayout,
-    pub(super) bindings: Vec<Binding>,
-}
-
 impl Pipeline {
-    /// Compiles `kernel` with the given values of its `override`s.
+    /// Compiles `kernel` with the given values of its `override`s, or returns the pipeline that this device has already
+    /// compiled for them.
     pub fn new(gpu: &Gpu, kernel: Kernel, overrides: &[(&str, f64)]) -> Result<Self, Error> {
-        let name = kernel.source.name;
         let text = resolve(kernel.source, kernel.shared)?;
-        let module = reflect(name, &text)?;
+        let key = Key::new(text.clone(), overrides);
+        gpu.pipelines.get_or_compile(key, || Self::compile(gpu, kernel.source.name, &text, overrides))
+    }
+
+    /// Compiles WGSL that contains all imports.
+    fn compile(gpu: &Gpu, name: &'static str, text: &str, overrides: &[(&str, f64)]) -> Result<Self, Error> {
+        let module = reflect(name, text)?;
         let (bytes, limit_bytes) = (wgsl::workgroup_bytes(&module), gpu.max_workgroup_bytes());
         if bytes > limit_bytes {
             return Err(Error::WorkgroupTooLarge { kernel: name, bytes, limit_bytes });
         }
-        let bindings = wgsl::bindings(&module);
+        let bindings: Arc<[Binding]> = wgsl::bindings(&module).into();
         let device = &gpu.device;
-        let described =
-            wgpu::ShaderModuleDescriptor { label: Some(name), source: wgpu::ShaderSource::Wgsl(text.into()) };
+        let source = wgpu::ShaderSource::Naga(Cow::Owned(module));
+        let described = wgpu::ShaderModuleDescriptor { label: Some(name), source };
         let checks = wgpu::ShaderRuntimeChecks { force_loop_bounding: false, ..wgpu::ShaderRuntimeChecks::checked() };
         // SAFETY: every loop of our kernels counts to a bound that is fixed before it starts.
         #[expect(unsafe_code, reason = "a second bound would cost time in every iteration of the innermost loops")]
@@ -93,7 +92,7 @@ impl Pipeline {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::gpu::GpuOptions;
+    use crate::gpu::{GpuOptions, Passes};
 
     #[test]
     fn kernel_exceeding_workgroup_memory_is_rejected() {
@@ -102,7 +101,41 @@ mod tests {
             @compute @workgroup_size(64)
             fn main(@builtin(local_invocation_index) lane: u32) { wg_all[lane] = vec4f(0.0); }";
         let kernel = Kernel { source: Source { name: "large", text }, shared: &[] };
-        let rejected = Pipeline::new(&gpu, kernel, &[]).unwrap_err();
-        assert!(matches!(rejected, Error::WorkgroupTooLarge { kernel: "large", bytes: 1_600_000, .. }), "{rejected}");
+        for _ in 0..2 {
+            let rejected = Pipeline::new(&gpu, kernel, &[]).unwrap_err();
+            let is_expected = matches!(rejected, Error::WorkgroupTooLarge { kernel: "large", bytes: 1_600_000, .. });
+            assert!(is_expected, "{rejected}");
+        }
+    }
+
+    /// A pipeline is compiled once per text and overrides, also if several threads ask for it at the same time.
+    #[test]
+    fn pipelines_are_compiled_once_per_text_and_overrides() {
+        const FIRST: &str = "
+            override VALUE = 1u;
+            @group(0) @binding(0) var<storage, read_write> output: array<u32>;
+            @compute @workgroup_size(1)
+            fn main() { output[0] = VALUE; }";
+        const SECOND: &str = "
+            override VALUE = 1u;
+            @group(0) @binding(0) var<storage, read_write> output: array<u32>;
+            @compute @workgroup_size(1)
+            fn main() { output[0] = VALUE + 10u; }";
+        let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+        let output = gpu.storage("output", 4).unwrap();
+        let mut passes = Passes::default();
+        let mut result = |text: &'static str, overrides: &[(&str, f64)]| {
+            let kernel = Kernel { source: Source { name: "constant", text }, shared: &[] };
+            let compiled = (0..4).into_par_iter().map(|_| Pipeline::new(&gpu, kernel, overrides).unwrap());
+            let compiled: Vec<Pipeline> = compiled.collect();
+            assert!(compiled.iter().all(|pipeline| pipeline.id == compiled[0].id));
+            passes.dispatch(&gpu, &compiled[0], 1, &[("output", &output)]);
+            passes.submit(&gpu);
+            (gpu.read::<u32>(&output, 1).unwrap()[0], gpu.pipelines.len())
+        };
+        assert_eq!(result(FIRST, &[]), (1, 1));
+        assert_eq!(result(FIRST, &[("VALUE", 5.0)]), (5, 2));
+        assert_eq!(result(SECOND, &[("VALUE", 5.0)]), (15, 3));
+        assert_eq!(result(FIRST, &[("VALUE", 5.0)]), (5, 3), "already compiled");
     }
 }

@@ -1,6 +1,80 @@
 //! Test helpers that check that kernels are valid, and that their structs have the same layout in Rust and WGSL.
 
-use super::{Kernel, reflect, resolve};
+use super::{Gpu, GpuOptions, Kernel, reflect, resolve};
+use parking_lot::Mutex;
+use std::sync::Arc;
+
+/// Devices of finished tests, with the options they were opened with.
+static DEVICES: Mutex<Vec<(GpuOptions, Arc<Gpu>)>> = Mutex::new(Vec::new());
+
+/// A device that no other test uses at the same time. It may have been used by an earlier test, so its pipelines are
+/// compiled already; it has no buffers left. Tests of the device itself open their own.
+pub(crate) fn test_gpu() -> Arc<Gpu> {
+    test_gpu_with(&GpuOptions::default())
+}
+
+/// [`test_gpu`] with options.
+pub(crate) fn test_gpu_with(options: &GpuOptions) -> Arc<Gpu> {
+    let mut devices = DEVICES.lock();
+    devices.retain(|(_, gpu)| gpu.check().is_ok());
+    // The only other owners of a device are the test that uses it and its models, which may drop buffers last.
+    let is_free = |gpu: &Arc<Gpu>| Arc::strong_count(gpu) == 1 && gpu.live_bytes() == 0;
+    if let Some((_, gpu)) = devices.iter().find(|(opened, gpu)| opened == options && is_free(gpu)) {
+        return gpu.clone();
+    }
+    let gpu = Gpu::open(options).unwrap();
+    if devices.is_empty() {
+        close_devices_at_exit();
+    }
+    devices.push((*options, gpu.clone()));
+    gpu
+}
+
+/// NVIDIA's driver may crash if a device is open when the process exits. The handler is registered after the driver's own
+/// handlers, so it runs before them.
+fn close_devices_at_exit() {
+    extern "C" fn close_devices() {
+        DEVICES.lock().clear();
+    }
+    static REGISTER: std::sync::Once = std::sync::Once::new();
+    REGISTER.call_once(|| {
+        // SAFETY: the handler is a function without arguments that does not unwind.
+        #[expect(unsafe_code, reason = "the test harness cannot call a function after the last test")]
+        let status = unsafe { libc::atexit(close_devices) };
+        assert_eq!(status, 0, "the C library keeps at least 32 handlers");
+    });
+}
+
+/// If set to `demand`, tests that need a real GPU fail without one instead of being skipped. `make test-gpu` sets it.
+const DEMAND_VARIABLE: &str = "FIELDRIG_GPU_TESTS";
+
+/// Options of a device with cooperative matrices of f16 numbers. If the adapter has none, reports the calling test as
+/// skipped and returns `None`.
+pub(crate) fn options_with_matrices() -> Option<GpuOptions> {
+    let options = GpuOptions::default();
+    has(&options, test_gpu().optional().half_matrices, "cooperative matrices of f16 numbers").then_some(options)
+}
+
+/// Options of a device with subgroups of at least 16 lanes. If the adapter has none, reports the calling test as skipped
+/// and returns `None`. Lavapipe has them if `LP_NATIVE_VECTOR_WIDTH` is 512.
+pub(crate) fn options_with_large_subgroups() -> Option<GpuOptions> {
+    let options = GpuOptions::default();
+    let is_large = test_gpu().optional().subgroup_lanes.is_some_and(|lanes| lanes >= 16);
+    has(&options, is_large, "subgroups of 16 or more lanes").then_some(options)
+}
+
+/// Reports the calling test as skipped if the adapter does not have a feature.
+fn has(options: &GpuOptions, is_available: bool, feature: &str) -> bool {
+    if !is_available {
+        let reason = format!("{} has no {feature}", test_gpu_with(options).describe());
+        assert!(
+            !std::env::var(DEMAND_VARIABLE).is_ok_and(|value| value == "demand"),
+            "this test needs a GPU: {reason}"
+        );
+        test_support::skip(reason);
+    }
+    is_available
+}
 
 /// Names and offsets in bytes of the fields of a struct, and its size.
 pub(crate) type StructLayout = (Vec<(String, usize)>, usize);

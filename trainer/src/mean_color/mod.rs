@@ -3,7 +3,7 @@
 //! It is registered like any other method but needs no kernels, so it also serves as a minimal example of a method.
 
 use crate::checkpoint::{Checkpoint, PendingCheckpoint};
-use crate::gpu::{Gpu, PassTiming};
+use crate::gpu::PassTiming;
 use crate::keyframe_signature::{self, KeyframeSignature};
 use crate::method_entry::MethodEntry;
 use crate::model_metadata::METADATA_FILE;

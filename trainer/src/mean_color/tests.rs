@@ -1,7 +1,7 @@
 //! A registered method is created, trained, saved, loaded and resumed by its name alone.
 
 use super::*;
-use crate::gpu::GpuOptions;
+use crate::gpu::testing::test_gpu;
 use crate::test_scenes as scenes;
 use crate::{CommonOptions, ModelKind, ModelSpec, Projection, Resumed, load, resume};
 use kinematics::Transform;
@@ -40,7 +40,7 @@ fn rendered(model: &mut dyn Method) -> Vec<u8> {
 
 #[test]
 fn registered_method_trains_saves_loads_and_resumes() {
-    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let gpu = test_gpu();
     let settings = [("rate", 0.25.into()), ("max_splats", 7.into())]; // The second one belongs to another method.
     let model_spec = ModelSpec::new(kind(), CommonOptions::default(), &settings).unwrap();
     let mut model = model_spec.start(gpu.clone()).unwrap();

@@ -12,6 +12,7 @@ use super::reference::pose::ImagePose;
 use super::reference::ray as reference;
 use super::reference::scene::{EMBEDDING_DIM, Ray, WEIGHTS, field, gradient, ray, samples};
 use super::reference::space::contract;
+use crate::gpu::testing::test_gpu_with;
 use crate::gpu::{Buffer, Gpu, GpuOptions, Passes, f32_of, f32s_of};
 use crate::mismatches::Mismatches;
 use crate::optim::reference::{Adam, Moments};
@@ -102,7 +103,7 @@ struct Bench {
 }
 
 fn bench(options: &GpuOptions, twin: &Field, rays: &[Ray], scales: &[f32]) -> Bench {
-    let gpu = Gpu::open(options).unwrap();
+    let gpu = test_gpu_with(options);
     let widths =
         Widths::new(&gpu, u32::try_from(twin.shape.n_cells.len()).unwrap(), 7, u32::try_from(EMBEDDING_DIM).unwrap());
     let n_samples = u32::try_from(rays.iter().map(|ray| ray.spans.len()).sum::<usize>()).unwrap();
@@ -174,10 +175,9 @@ fn bench(options: &GpuOptions, twin: &Field, rays: &[Ray], scales: &[f32]) -> Be
     }
 }
 
-/// All optional features; all except cooperative matrices; none.
-fn gpu_variants() -> [GpuOptions; 3] {
-    let all = GpuOptions::default();
-    [all, GpuOptions { matrices: false, ..all }, GpuOptions { optional_features: false, ..all }]
+/// Without cooperative matrices, as on software adapters.
+fn without_matrices() -> GpuOptions {
+    GpuOptions { matrices: false, ..GpuOptions::default() }
 }
 
 /// Factor on gradient tolerances. With cooperative matrices, gradients are f16 numbers with 11 bits, although sums are
@@ -203,101 +203,94 @@ fn expected(twin: &Field, rays: &[Ray]) -> FieldGrad {
     sum
 }
 
-#[test]
-fn colors_and_gradients_match_twin() {
+fn check_colors_and_gradients(options: &GpuOptions) {
     let (twin, rays) = (field(7), rays());
     let expected = expected(&twin, &rays);
     let largest = expected.table.as_flattened().iter().fold(0.0f64, |max_abs, v| max_abs.max(v.abs()));
     let scale = f32_of((2f64.powi(28) / largest).log2().floor().exp2());
-    for options in gpu_variants() {
-        let bench = bench(&options, &twin, &rays, &vec![scale; twin.shape.n_cells.len()]);
-        let Bench { gpu, pipelines, widths, field, samples: batch, step, gradients, slot, image_params } = &bench;
-        let passes = FieldPasses { gpu, pipelines, field, samples: batch, slot, image_params };
-        let mut list = Passes::default();
-        passes.convert_weights(&mut list);
-        passes.forward(&mut list, step);
-        passes.backward(&mut list, step, gradients);
-        list.submit(gpu);
+    let bench = bench(options, &twin, &rays, &vec![scale; twin.shape.n_cells.len()]);
+    let Bench { gpu, pipelines, widths, field, samples: batch, step, gradients, slot, image_params } = &bench;
+    let passes = FieldPasses { gpu, pipelines, field, samples: batch, slot, image_params };
+    let mut list = Passes::default();
+    passes.convert_weights(&mut list);
+    passes.forward(&mut list, step);
+    passes.backward(&mut list, step, gradients);
+    list.submit(gpu);
 
-        let tolerance_scale = tolerance_scale_of(widths);
-        // Forward values have twice as many bits as gradients.
-        let (abs, rel) = if widths.is_half_precision { (5e-5, 5e-5) } else { (1e-5, 1e-5) };
-        let mut mismatches = Mismatches::default();
-        let ray_colors: Vec<[f32; 4]> = gpu.read(&step.ray_colors, rays.len()).unwrap();
-        let errors: Vec<[f32; 2]> = gpu.read(&step.ray_errors, rays.len()).unwrap();
-        for (ix, ray) in rays.iter().enumerate() {
-            let picture = reference::composite(&samples(&twin, ray));
-            for (channel, (got, expected)) in ray_colors[ix].iter().zip(picture.rgb).enumerate() {
-                mismatches.check(format!("color {ix} {channel}"), (*got).into(), expected, abs, rel);
-            }
-            mismatches.check(format!("transmittance {ix}"), ray_colors[ix][3].into(), picture.transmittance, abs, rel);
-            mismatches.check(format!("distance {ix}"), errors[ix][1].into(), picture.distance, abs, rel);
+    let tolerance_scale = tolerance_scale_of(widths);
+    // Forward values have twice as many bits as gradients.
+    let (abs, rel) = if widths.is_half_precision { (5e-5, 5e-5) } else { (1e-5, 1e-5) };
+    let mut mismatches = Mismatches::default();
+    let ray_colors: Vec<[f32; 4]> = gpu.read(&step.ray_colors, rays.len()).unwrap();
+    let errors: Vec<[f32; 2]> = gpu.read(&step.ray_errors, rays.len()).unwrap();
+    for (ix, ray) in rays.iter().enumerate() {
+        let picture = reference::composite(&samples(&twin, ray));
+        for (channel, (got, expected)) in ray_colors[ix].iter().zip(picture.rgb).enumerate() {
+            mismatches.check(format!("color {ix} {channel}"), (*got).into(), expected, abs, rel);
         }
-        let n_samples = gpu.read::<u32>(&batch.batch, 2).unwrap()[1];
-        let got = summed(gpu, step, widths, n_samples);
-        let of_weights = [&expected.density[..], &expected.color].concat();
-        let abs = [&expected.density, &expected.color].map(|gradients| 2e-5 * tolerance_scale * max_abs_of(gradients));
-        check_weights(&mut mismatches, &got, &twin, widths, &of_weights, abs);
-        let got: Vec<i32> = gpu.read(&gradients.grid, 2 * twin.table.len()).unwrap();
-        for (ix, (got, expected)) in got.iter().zip(expected.table.as_flattened()).enumerate() {
-            mismatches.check(
-                format!("entry {ix}"),
-                f64::from(*got) / f64::from(scale),
-                *expected,
-                2e-5 * tolerance_scale * largest,
-                1e-4 * tolerance_scale,
-            );
-        }
-        mismatches.assert_none();
-        assert_eq!(gpu.read::<u32>(&gradients.counts, 1).unwrap(), [0]);
+        mismatches.check(format!("transmittance {ix}"), ray_colors[ix][3].into(), picture.transmittance, abs, rel);
+        mismatches.check(format!("distance {ix}"), errors[ix][1].into(), picture.distance, abs, rel);
     }
+    let n_samples = gpu.read::<u32>(&batch.batch, 2).unwrap()[1];
+    let got = summed(gpu, step, widths, n_samples);
+    let of_weights = [&expected.density[..], &expected.color].concat();
+    let abs = [&expected.density, &expected.color].map(|gradients| 2e-5 * tolerance_scale * max_abs_of(gradients));
+    check_weights(&mut mismatches, &got, &twin, widths, &of_weights, abs);
+    let got: Vec<i32> = gpu.read(&gradients.grid, 2 * twin.table.len()).unwrap();
+    for (ix, (got, expected)) in got.iter().zip(expected.table.as_flattened()).enumerate() {
+        mismatches.check(
+            format!("entry {ix}"),
+            f64::from(*got) / f64::from(scale),
+            *expected,
+            2e-5 * tolerance_scale * largest,
+            1e-4 * tolerance_scale,
+        );
+    }
+    mismatches.assert_none();
+    assert_eq!(gpu.read::<u32>(&gradients.counts, 1).unwrap(), [0]);
 }
 
 /// Rendered colors differ from the twin because skipped samples take the color of the selected one.
-#[test]
-fn pictures_match_twin() {
+fn check_pictures(options: &GpuOptions) {
     let (twin, rays) = (field(7), rays());
-    for options in gpu_variants() {
-        let bench = bench(&options, &twin, &rays, &vec![1.0; twin.shape.n_cells.len()]);
-        let Bench { gpu, pipelines, widths, field, samples: batch, slot, image_params, .. } = &bench;
-        let passes = FieldPasses { gpu, pipelines, field, samples: batch, slot, image_params };
-        let n_rays = u32::try_from(rays.len()).unwrap();
-        let canvas = Canvas::new(gpu, widths, field.n_entries, n_rays.into(), n_rays, batch.n_samples).unwrap();
-        let n_spans = rays.iter().map(|ray| ray.spans.len()).sum::<usize>();
-        let spans: Vec<Span> = gpu.read(&batch.spans, n_spans).unwrap();
-        let numbered: Vec<Span> = (0..).zip(spans).map(|(sample, span)| Span { sample, ..span }).collect();
-        gpu.write(&batch.spans, 0, bytemuck::cast_slice(&numbered));
-        gpu.write(&canvas.selected, 0, bytemuck::bytes_of(&Batch::of(n_rays)));
-        let march = params::March { max_found: u32::MAX, ..bytemuck::Zeroable::zeroed() };
-        gpu.write(&slot.march, 0, bytemuck::bytes_of(&march));
-        let dark = [[0.0f32, 0.0, 0.0, 1.0], [0.0, 0.0, 1e9, 0.0]];
-        gpu.write(&canvas.light, 0, bytemuck::cast_slice(&vec![dark; rays.len()]));
-        let mut list = Passes::default();
-        passes.convert_for_picture(&mut list, &canvas);
-        passes.select(&mut list, &canvas);
-        passes.picture_colors(&mut list, &canvas);
-        passes.show(&mut list, &canvas);
-        list.submit(gpu);
+    let bench = bench(options, &twin, &rays, &vec![1.0; twin.shape.n_cells.len()]);
+    let Bench { gpu, pipelines, widths, field, samples: batch, slot, image_params, .. } = &bench;
+    let passes = FieldPasses { gpu, pipelines, field, samples: batch, slot, image_params };
+    let n_rays = u32::try_from(rays.len()).unwrap();
+    let canvas = Canvas::new(gpu, widths, field.n_entries, n_rays.into(), n_rays, batch.n_samples).unwrap();
+    let n_spans = rays.iter().map(|ray| ray.spans.len()).sum::<usize>();
+    let spans: Vec<Span> = gpu.read(&batch.spans, n_spans).unwrap();
+    let numbered: Vec<Span> = (0..).zip(spans).map(|(sample, span)| Span { sample, ..span }).collect();
+    gpu.write(&batch.spans, 0, bytemuck::cast_slice(&numbered));
+    gpu.write(&canvas.selected, 0, bytemuck::bytes_of(&Batch::of(n_rays)));
+    let march = params::March { max_found: u32::MAX, ..bytemuck::Zeroable::zeroed() };
+    gpu.write(&slot.march, 0, bytemuck::bytes_of(&march));
+    let dark = [[0.0f32, 0.0, 0.0, 1.0], [0.0, 0.0, 1e9, 0.0]];
+    gpu.write(&canvas.light, 0, bytemuck::cast_slice(&vec![dark; rays.len()]));
+    let mut list = Passes::default();
+    passes.convert_for_picture(&mut list, &canvas);
+    passes.select(&mut list, &canvas);
+    passes.picture_colors(&mut list, &canvas);
+    passes.show(&mut list, &canvas);
+    list.submit(gpu);
 
-        let light: Vec<[[f32; 4]; 2]> = gpu.read(&canvas.light, rays.len()).unwrap();
-        let mut mismatches = Mismatches::default();
-        for (ix, (ray, [[red, green, blue, transmittance], [distance, ..]])) in rays.iter().zip(light).enumerate() {
-            let picture = reference::composite(&samples(&twin, ray));
-            for (channel, (got, expected)) in [red, green, blue].into_iter().zip(picture.rgb).enumerate() {
-                mismatches.check(format!("color {ix} {channel}"), got.into(), expected, 0.02, 0.0);
-            }
-            // Rays end at a transmittance of 1/512.
-            mismatches.check(format!("transmittance {ix}"), transmittance.into(), picture.transmittance, 0.002, 0.0);
-            mismatches.check(format!("distance {ix}"), distance.into(), picture.distance, 0.002, 0.002);
+    let light: Vec<[[f32; 4]; 2]> = gpu.read(&canvas.light, rays.len()).unwrap();
+    let mut mismatches = Mismatches::default();
+    for (ix, (ray, [[red, green, blue, transmittance], [distance, ..]])) in rays.iter().zip(light).enumerate() {
+        let picture = reference::composite(&samples(&twin, ray));
+        for (channel, (got, expected)) in [red, green, blue].into_iter().zip(picture.rgb).enumerate() {
+            mismatches.check(format!("color {ix} {channel}"), got.into(), expected, 0.02, 0.0);
         }
-        mismatches.assert_none();
+        // Rays end at a transmittance of 1/512.
+        mismatches.check(format!("transmittance {ix}"), transmittance.into(), picture.transmittance, 0.002, 0.0);
+        mismatches.check(format!("distance {ix}"), distance.into(), picture.distance, 0.002, 0.002);
     }
+    mismatches.assert_none();
 }
 
 /// Gradients with respect to poses and appearance embeddings of images, and the first step of each parameter. Images
 /// have seven rays, the last one has fewer.
-#[test]
-fn image_param_gradients_match_twin() {
+fn check_image_param_gradients(options: &GpuOptions) {
     const RAYS_PER_IMAGE: usize = 7;
     const N_IMAGES: usize = (N_RAYS as usize).div_ceil(RAYS_PER_IMAGE);
     const ALL: u32 = (1 << params::IMAGE_PARAM_STRIDE) - 1;
@@ -314,9 +307,8 @@ fn image_param_gradients_match_twin() {
         .collect();
     let largest =
         [0, 1, 2].map(|part| expected.iter().flat_map(|ray| ray[part]).fold(0.0f64, |max_abs, v| max_abs.max(v.abs())));
-    for (options, learned) in gpu_variants().into_iter().flat_map(|options| [(options, ALL), (options, 0b1_1100_0000)])
-    {
-        let bench = bench(&options, &twin, &rays, &vec![1.0; twin.shape.n_cells.len()]);
+    for learned in [ALL, 0b1_1100_0000] {
+        let bench = bench(options, &twin, &rays, &vec![1.0; twin.shape.n_cells.len()]);
         let Bench { gpu, pipelines, widths, field, samples: batch, step, gradients, slot, image_params } = &bench;
         let passes = FieldPasses { gpu, pipelines, field, samples: batch, slot, image_params };
         let rule = AdamRule {
@@ -450,8 +442,7 @@ fn optimizer_steps_match_twin() {
     let of_weights = AdamRule { rate: 0.01, weight_decay: 0.5, ..grid_rule };
     let first_scale = 2f32.powi(28); // Fine enough for the first step; the kernels then adapt the scales.
     // Uses f32 layers, because a step along f16 noise would be as long as a real step.
-    let options = GpuOptions { matrices: false, ..GpuOptions::default() };
-    let bench = bench(&options, &twin, &rays, &vec![first_scale; twin.shape.n_cells.len()]);
+    let bench = bench(&without_matrices(), &twin, &rays, &vec![first_scale; twin.shape.n_cells.len()]);
     let Bench { gpu, pipelines, widths, field: buffers, samples, step: kept_step, gradients, slot, image_params } =
         &bench;
     let moments = FieldMoments::new(gpu, &twin.shape, widths, &grid_rule).unwrap();
@@ -512,44 +503,41 @@ fn optimizer_steps_match_twin() {
 
 /// Checks the first step of the weights against the summed gradients of the kernels. The twin's gradients differ too
 /// much from f16 gradients to predict the sign of a small gradient.
-#[test]
-fn first_step_follows_summed_gradients() {
+fn check_first_step(options: &GpuOptions) {
     let (twin, rays) = (field(7), rays());
-    for options in gpu_variants() {
-        let bench = bench(&options, &twin, &rays, &vec![1.0; twin.shape.n_cells.len()]);
-        let Bench { gpu, pipelines, widths, field, samples, step, gradients, slot, image_params } = &bench;
-        let passes = FieldPasses { gpu, pipelines, field, samples, slot, image_params };
-        let rule = AdamRule {
-            rate: 0.01,
-            final_rate_frac: 1.0,
-            betas: [0.75, 0.875],
-            epsilon: 1e-4,
-            weight_decay: 0.5,
-            n_planned_steps: 1.0,
-            unused: 0.0,
-        };
-        let moments = FieldMoments::new(gpu, &twin.shape, widths, &rule).unwrap();
-        let rules = [gpu.uniform_with("rule", &rule), gpu.uniform_with("rule", &rule)];
-        let mut list = Passes::default();
-        passes.convert_weights(&mut list);
-        passes.forward(&mut list, step);
-        passes.backward(&mut list, step, gradients);
-        passes.update(&mut list, [&rules[0], &rules[1]], step, gradients, &moments);
-        list.submit(gpu);
-        let before = weights(&twin, widths);
-        let got: Vec<f32> = gpu.read(&field.weights, before.len()).unwrap();
-        let n_samples = gpu.read::<u32>(&samples.batch, 2).unwrap()[1];
-        let mut mismatches = Mismatches::default();
-        let mut n_moved = 0;
-        for (ix, (derivative, before)) in summed(gpu, step, widths, n_samples).into_iter().zip(before).enumerate() {
-            let (derivative, before) = (f64::from(derivative), f64::from(before));
-            let expected = before - 0.01 * (derivative / (derivative.abs() + 1e-4) + 0.5 * before);
-            mismatches.check(format!("weight {ix}"), got[ix].into(), expected, 2e-5, 1e-5);
-            n_moved += usize::from(derivative.abs() > 1e-5);
-        }
-        mismatches.assert_none();
-        assert!(n_moved > 100, "only {n_moved} weights have significant gradients");
+    let bench = bench(options, &twin, &rays, &vec![1.0; twin.shape.n_cells.len()]);
+    let Bench { gpu, pipelines, widths, field, samples, step, gradients, slot, image_params } = &bench;
+    let passes = FieldPasses { gpu, pipelines, field, samples, slot, image_params };
+    let rule = AdamRule {
+        rate: 0.01,
+        final_rate_frac: 1.0,
+        betas: [0.75, 0.875],
+        epsilon: 1e-4,
+        weight_decay: 0.5,
+        n_planned_steps: 1.0,
+        unused: 0.0,
+    };
+    let moments = FieldMoments::new(gpu, &twin.shape, widths, &rule).unwrap();
+    let rules = [gpu.uniform_with("rule", &rule), gpu.uniform_with("rule", &rule)];
+    let mut list = Passes::default();
+    passes.convert_weights(&mut list);
+    passes.forward(&mut list, step);
+    passes.backward(&mut list, step, gradients);
+    passes.update(&mut list, [&rules[0], &rules[1]], step, gradients, &moments);
+    list.submit(gpu);
+    let before = weights(&twin, widths);
+    let got: Vec<f32> = gpu.read(&field.weights, before.len()).unwrap();
+    let n_samples = gpu.read::<u32>(&samples.batch, 2).unwrap()[1];
+    let mut mismatches = Mismatches::default();
+    let mut n_moved = 0;
+    for (ix, (derivative, before)) in summed(gpu, step, widths, n_samples).into_iter().zip(before).enumerate() {
+        let (derivative, before) = (f64::from(derivative), f64::from(before));
+        let expected = before - 0.01 * (derivative / (derivative.abs() + 1e-4) + 0.5 * before);
+        mismatches.check(format!("weight {ix}"), got[ix].into(), expected, 2e-5, 1e-5);
+        n_moved += usize::from(derivative.abs() > 1e-5);
     }
+    mismatches.assert_none();
+    assert!(n_moved > 100, "only {n_moved} weights have significant gradients");
 }
 
 #[test]
@@ -566,4 +554,58 @@ fn saturated_gradients_are_counted_and_skipped() {
     let n_saturated = gpu.read::<u32>(&gradients.counts, 1).unwrap()[0];
     assert!(n_saturated > N_RAYS * 7 * 8, "only {n_saturated}");
     assert!(gpu.read::<i32>(&gradients.grid, 2 * twin.table.len()).unwrap().iter().all(|sum| *sum == 0));
+}
+
+#[test]
+fn colors_and_gradients_match_twin() {
+    check_colors_and_gradients(&without_matrices());
+}
+
+#[test]
+fn pictures_match_twin() {
+    check_pictures(&without_matrices());
+}
+
+#[test]
+fn image_param_gradients_match_twin() {
+    check_image_param_gradients(&without_matrices());
+}
+
+#[test]
+fn first_step_follows_summed_gradients() {
+    check_first_step(&without_matrices());
+}
+
+/// The same tests with cooperative matrices of f16 numbers, which no software adapter has.
+mod needs_matrices {
+    use super::*;
+    use crate::gpu::testing::options_with_matrices;
+
+    #[test]
+    fn colors_and_gradients_match_twin() {
+        if let Some(options) = options_with_matrices() {
+            check_colors_and_gradients(&options);
+        }
+    }
+
+    #[test]
+    fn pictures_match_twin() {
+        if let Some(options) = options_with_matrices() {
+            check_pictures(&options);
+        }
+    }
+
+    #[test]
+    fn image_param_gradients_match_twin() {
+        if let Some(options) = options_with_matrices() {
+            check_image_param_gradients(&options);
+        }
+    }
+
+    #[test]
+    fn first_step_follows_summed_gradients() {
+        if let Some(options) = options_with_matrices() {
+            check_first_step(&options);
+        }
+    }
 }

@@ -129,11 +129,11 @@ fn synthetic_rays(nerf_budget: NerfBudget) -> Vec<Ray> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::gpu::GpuOptions;
+    use crate::gpu::testing::test_gpu;
 
     #[test]
     fn timed_step_has_requested_sample_count() {
-        let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+        let gpu = test_gpu();
         let figures = time_steps(&gpu, 64, 512, 1).unwrap();
         assert_eq!(figures.n_samples, 512);
         assert!(figures.step_millis > 0.0 && figures.step_wall_millis > 0.0);

@@ -472,7 +472,9 @@ impl FieldTrainer {
     ) -> Result<Option<Rendered>, Error> {
         let n_pixels = camera.size_px[0] as usize * camera.size_px[1] as usize;
         self.make_canvas(gpu, n_pixels as u64)?;
-        let Some((slot, samples, canvas)) = &self.picture else { return Err(Error::DeviceLost) };
+        let Some((slot, samples, canvas)) = &self.picture else {
+            return Err(Error::internal("the canvas of a picture is missing"));
+        };
         gpu.write(&canvas.view, 0, bytemuck::bytes_of(&camera.view()));
         let backdrop = Backdrop { srgb: background_srgb, radius_m: f32_of(extent.radius_m) };
         gpu.write(&canvas.backdrop, 0, bytemuck::bytes_of(&backdrop));

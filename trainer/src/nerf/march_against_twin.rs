@@ -7,7 +7,8 @@ use super::passes::FieldPasses;
 use super::reference::grid::GridShape;
 use super::reference::march::March;
 use super::reference::space::contract;
-use crate::gpu::{Gpu, GpuOptions, Passes, f32_of, f32s_of};
+use crate::gpu::testing::test_gpu;
+use crate::gpu::{Passes, f32_of, f32s_of};
 use crate::mismatches::Mismatches;
 use crate::random::F32Random;
 
@@ -44,7 +45,7 @@ fn rays() -> Vec<TestRay> {
 
 #[test]
 fn samples_lie_in_occupied_cells_within_limit() {
-    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let gpu = test_gpu();
     let shape = GridShape::between(2, 4, 2, 6);
     let widths = Widths::new(&gpu, 2, 4, 0);
     let pipelines = FieldPipelines::new(&gpu, &widths, CAPACITY, 0).unwrap();

@@ -324,7 +324,7 @@ impl Method for NerfModel {
         for slot_ix in 0..n_steps {
             self.record(usize::try_from(slot_ix).expect("few steps"))?;
         }
-        let Some((_, field_trainer)) = &mut self.field else { return Err(Error::DeviceLost) };
+        let Some((_, field_trainer)) = &mut self.field else { return Err(no_field()) };
         let batch = field_trainer.submit(&self.gpu);
         self.finish_in_flight()?; // Waits for the previous submit while this one runs.
         self.submits.begin(batch, n_steps, since);
@@ -389,7 +389,7 @@ impl Method for NerfModel {
             return Ok(Vec::new());
         }
         self.record(0)?;
-        let Some((_, field_trainer)) = &mut self.field else { return Err(Error::DeviceLost) };
+        let Some((_, field_trainer)) = &mut self.field else { return Err(no_field()) };
         field_trainer.submit_timed(&self.gpu)
     }
 
@@ -418,4 +418,9 @@ impl Method for NerfModel {
     fn checkpoint(&mut self) -> Result<PendingCheckpoint, Error> {
         self.take_checkpoint()
     }
+}
+
+/// The error if a step is taken before the field is created.
+fn no_field() -> Error {
+    Error::internal("a step was recorded before the field was created")
 }

@@ -9,7 +9,8 @@ use super::sizes::Sizes;
 use super::{NerfModel, params};
 use crate::edits::{Edit, Edits};
 use crate::eval::{self, PixelPair};
-use crate::gpu::{Gpu, GpuOptions};
+use crate::gpu::Gpu;
+use crate::gpu::testing::test_gpu;
 use crate::model_options::{CommonOptions, ModelOptions};
 use crate::test_scenes as scenes;
 use crate::{Aabb, CorrectedKeyframe, Error, Method, ModelKind, Picture, Projection, Recalibrate, RenderRequest};
@@ -65,7 +66,7 @@ fn ball_on_floor(n: usize) -> Vec<Arc<Keyframe>> {
 }
 
 fn gpu() -> Arc<Gpu> {
-    Gpu::open(&GpuOptions::default()).unwrap()
+    test_gpu()
 }
 
 fn model_with(options: ModelOptions<NerfOptions>, keyframes: &[Arc<Keyframe>]) -> NerfModel {
@@ -248,6 +249,7 @@ fn occupancy_cells_are_refined() {
 /// trial gives the same result.
 #[test]
 fn drifting_poses_are_corrected() {
+    const AFTER_TRIAL: u64 = 300;
     let true_keyframes = ball_on_floor(24);
     let drifted = |keyframe: &Arc<Keyframe>| {
         let phase = 0.35 * keyframe.stamp.0 as f64;
@@ -279,6 +281,9 @@ fn drifting_poses_are_corrected() {
     let before_m = mean_position_error_m(&mut model, &drifted_keyframes);
     train_until(&mut model, 90); // In the middle of the trial.
     let checkpoint = state(&mut model);
+    train_until(&mut model, AFTER_TRIAL);
+    assert_eq!(model.report().len(), 1, "the trial has ended");
+    let after_trial = state(&mut model);
     train_until(&mut model, 600);
     let after_m = mean_position_error_m(&mut model, &drifted_keyframes);
     assert!(model.report()[0].kept, "{:?}", model.report());
@@ -288,8 +293,8 @@ fn drifting_poses_are_corrected() {
     let (mut resumed, rest) = NerfModel::resume(gpu(), &checkpoint, &drifted_keyframes).unwrap();
     assert_eq!(rest.len(), 6, "validation images must be returned");
     rest.into_iter().for_each(|keyframe| resumed.push(keyframe).unwrap());
-    train_until(&mut resumed, 600);
-    assert!(state(&mut model).arrays == state(&mut resumed).arrays, "the trial must restart and end the same");
+    train_until(&mut resumed, AFTER_TRIAL);
+    assert!(after_trial.arrays == state(&mut resumed).arrays, "the trial must restart and end the same");
 
     let folder = tempfile::tempdir().unwrap();
     model.save(folder.path()).unwrap();

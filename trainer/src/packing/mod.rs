@@ -179,7 +179,7 @@ impl Rendered {
                 }
             }
         }
-        rendered.ok_or(Error::DeviceLost)
+        rendered.ok_or_else(|| Error::internal("no view of the picture was read back"))
     }
 
     /// Like [`Self::of`], but never packed.
@@ -194,7 +194,7 @@ impl Rendered {
     pub(crate) fn into_picture(self) -> Result<Picture, Error> {
         match self {
             Self::Picture(picture) => Ok(picture),
-            Self::Packed(_) => Err(Error::DeviceLost), // Drawn with another `Output`.
+            Self::Packed(_) => Err(Error::internal("a packed picture was read as pixels")),
         }
     }
 
@@ -365,7 +365,7 @@ impl Packer {
             self.tables = Some((quality, gpu.storage_with("packing.tables", bytemuck::cast_slice(&tables))?));
         }
         let Self { transform, code, offsets, join, halve, count, codes, tables, buffers } = self;
-        let buffers = buffers.as_ref().ok_or(Error::DeviceLost)?;
+        let buffers = buffers.as_ref().ok_or_else(|| Error::internal("the buffers of the packer are missing"))?;
         gpu.write(&buffers.packing, 0, bytemuck::bytes_of(&sizes));
         let uniform = ("packing", &buffers.packing);
         let packed = ("packed", &buffers.packed);
@@ -500,7 +500,7 @@ fn created<'a>(packer: &'a mut Option<Packer>, gpu: &Gpu) -> Result<&'a mut Pack
     if packer.is_none() {
         *packer = Some(Packer::new(gpu)?);
     }
-    packer.as_mut().ok_or(Error::DeviceLost)
+    packer.as_mut().ok_or_else(|| Error::internal("the packer is missing"))
 }
 
 /// Assembles the data read back from [`Packer::record`]. `None` if the JPEG file was too long.
@@ -535,8 +535,9 @@ pub(crate) fn unpack(packing: Packing, size_px: [u32; 2], parts: &[&[u8]]) -> Op
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::gpu::Kernel;
+    use crate::gpu::testing::test_gpu;
     use crate::gpu::testing::{assert_layout, assert_valid};
-    use crate::gpu::{GpuOptions, Kernel};
 
     const KERNELS: &[Kernel] = &[
         kernel!("jpeg_transform"),
@@ -567,7 +568,7 @@ mod tests {
 
     impl Fixture {
         fn new() -> Self {
-            let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+            let gpu = test_gpu();
             Self { packer: Packer::new(&gpu).unwrap(), passes: Passes::default(), gpu }
         }
 

@@ -121,7 +121,7 @@ impl Panorama {
             *panorama = None; // Freed before the larger one is allocated.
             *panorama = Some(Self::new(gpu, n_pixels)?);
         }
-        let panorama = panorama.as_ref().ok_or(Error::DeviceLost)?;
+        let panorama = panorama.as_ref().ok_or_else(|| Error::internal("the panorama is missing"))?;
         let Self { copy_face, face: params, pixels, depths, .. } = panorama;
         gpu.write(params, 0, bytemuck::bytes_of(&face.params()));
         let buffers = [

@@ -1,7 +1,7 @@
 //! Rules that every registered method must follow.
 
 use super::*;
-use crate::gpu::{Gpu, GpuOptions};
+use crate::gpu::testing::test_gpu;
 use crate::{CommonOptions, ModelSpec, load, resume, test_scenes};
 use std::collections::BTreeSet;
 
@@ -21,7 +21,7 @@ fn names_files_and_extensions_are_unique() {
 
 #[test]
 fn untrained_model_of_every_method_is_resumed_saved_and_recognized() {
-    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let gpu = test_gpu();
     for kind in ModelKind::ALL {
         let common = CommonOptions { seed: 5, n_planned_steps: 90, ..CommonOptions::default() };
         let mut model = ModelSpec::new(*kind, common.clone(), &[]).unwrap().start(gpu.clone()).unwrap();
@@ -48,7 +48,7 @@ fn untrained_model_of_every_method_is_resumed_saved_and_recognized() {
 /// A live run deletes removed keyframes when it writes the next checkpoint.
 #[test]
 fn removed_keyframe_is_not_needed_to_resume() {
-    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let gpu = test_gpu();
     let keyframes = test_scenes::ring(&[test_scenes::floor()], nalgebra::Point3::origin(), 4);
     for kind in ModelKind::ALL {
         let mut model = ModelSpec::new(*kind, CommonOptions::default(), &[]).unwrap().start(gpu.clone()).unwrap();
@@ -67,7 +67,7 @@ fn removed_keyframe_is_not_needed_to_resume() {
 
 #[test]
 fn checkpoint_of_an_unknown_method_is_rejected() {
-    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let gpu = test_gpu();
     let checkpoint = crate::checkpoint::Checkpoint::new("mesh", serde_json::json!({}), Vec::new());
     assert!(matches!(resume(gpu, &checkpoint, &[]), Err(Error::UnknownMethod { name }) if name == "mesh"));
 }

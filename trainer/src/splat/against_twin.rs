@@ -9,6 +9,7 @@ use super::params::{Camera, LOW_PASS_PX2, Rule, Supervision, status};
 use super::passes::{Target, ViewPasses};
 use super::reference::random::uniform3;
 use super::reference::{self, RenderedImage, Splat, Upstream, View, scene};
+use crate::gpu::testing::test_gpu_with;
 use crate::gpu::{Buffer, Gpu, GpuOptions, Passes, f32_of};
 use crate::loss::reference as loss_reference;
 use crate::mismatches::Mismatches;
@@ -70,7 +71,7 @@ fn camera_of(view: &View) -> Camera {
 
 impl KernelFixture {
     pub(super) fn new(options: &GpuOptions, view: &View, arrays: &SplatArrays) -> Self {
-        let gpu = Gpu::open(options).unwrap();
+        let gpu = test_gpu_with(options);
         let draw = DrawPipelines::new(&gpu).unwrap();
         let train = TrainPipelines::new(&gpu).unwrap();
         let n_splats = u32::try_from(arrays.means.len()).unwrap();
@@ -128,12 +129,16 @@ pub(super) fn unambiguous_pixels(view: &View, splats: &[Splat]) -> Vec<bool> {
     unambiguous
 }
 
-#[test]
-fn pictures_match_the_twin() {
+fn check_pictures(options: &GpuOptions) {
     for (view, seed) in [(scene::tilted_view(), 1), (scene::rolling_view(), 2)] {
         let splats = scene::small_scene(seed, 40);
-        check_picture(&KernelFixture::new(&GpuOptions::default(), &view, &arrays_of(&splats)), &view, &splats);
+        check_picture(&KernelFixture::new(options, &view, &arrays_of(&splats)), &view, &splats);
     }
+}
+
+#[test]
+fn pictures_match_the_twin() {
+    check_pictures(&GpuOptions::default());
 }
 
 /// A step renders the splats that it does not leave out, with higher opacities.
@@ -206,30 +211,27 @@ pub(super) fn target_of(image: &RenderedImage, size_px: [u32; 2]) -> loss_refere
     }
 }
 
-#[test]
-fn gradients_match_the_twin() {
+fn check_short_lists(variants: &[GpuOptions]) {
     for (view, seed) in [(scene::tilted_view(), 3), (scene::rolling_view(), 4)] {
-        check_gradients_with_loss(&view, &scene::small_scene(seed, 40));
+        check_gradients_with_loss(&view, &scene::small_scene(seed, 40), variants);
     }
 }
 
 /// Lists of several segments, of splats that touch more tiles than one lane of `update` sums.
-#[test]
-fn gradients_of_long_lists_match_the_twin() {
+fn check_long_lists(variants: &[GpuOptions]) {
     let (view, splats) = long_lists(400, 2.5, -4.4);
-    check_gradients_with_loss(&view, &splats);
+    check_gradients_with_loss(&view, &splats, variants);
 }
 
 /// Pixels that end in different segments of the same list.
-#[test]
-fn pixels_that_end_in_long_lists_match_the_twin() {
+fn check_ends_in_long_lists(variants: &[GpuOptions]) {
     let (view, splats) = long_lists(1000, 0.5, -3.7);
     let mut n_contributors: Vec<usize> = reference::decide(&view, &splats).contributors.iter().map(Vec::len).collect();
     n_contributors.sort_unstable();
     let n_pixels = n_contributors.len();
     let [low, high] = [n_contributors[n_pixels / 10], n_contributors[n_pixels * 9 / 10]];
     assert!(low > 256 && high > low + 100 && high < 900, "{low} to {high} splats per pixel");
-    check_gradients_with_loss(&view, &splats);
+    check_gradients_with_loss(&view, &splats, variants);
 }
 
 /// Splats with about the given logarithm of their size in meters and logit of their opacity.
@@ -253,8 +255,8 @@ fn long_lists(n: usize, log_scale: f64, opacity_logit: f64) -> (View, Vec<Splat>
     (view, splats)
 }
 
-/// Compares the gradients of a loss with color, D-SSIM and depth, for both kernel variants.
-fn check_gradients_with_loss(view: &View, splats: &[Splat]) {
+/// Compares the gradients of a loss with color, D-SSIM and depth, for kernel variants.
+fn check_gradients_with_loss(view: &View, splats: &[Splat], variants: &[GpuOptions]) {
     let rendered = reference::render(view, splats);
     let unambiguous = unambiguous_pixels(view, splats);
     let mut target = target_of(&rendered, view.size_px);
@@ -271,8 +273,8 @@ fn check_gradients_with_loss(view: &View, splats: &[Splat]) {
         background_rgb: [0.125, 0.25, 0.5],
     };
     let (_, upstream) = loss_reference::loss(&rendered, &target, &weights);
-    for options in adapter_options() {
-        check_gradients(&options, view, splats, &target, &weights, &upstream);
+    for options in variants {
+        check_gradients(options, view, splats, &target, &weights, &upstream);
     }
 }
 
@@ -504,8 +506,7 @@ fn check_camera_gradients(
 
 /// The first few splats in a stack of opaque splats saturate every tile. The splats behind them must get no gradient,
 /// even if their slots contain gradients of an earlier step.
-#[test]
-fn hidden_splats_have_no_gradient() {
+fn check_hidden_splats(variants: &[GpuOptions]) {
     const N_VISIBLE: usize = 8;
     let view = scene::tilted_view();
     let world_from_camera = view.camera_from_world.inverse();
@@ -518,8 +519,8 @@ fn hidden_splats_have_no_gradient() {
         splat.log_scale = [3.0; 3]; // Far larger than the image.
         splat.opacity_logit = 8.0;
     }
-    for options in adapter_options() {
-        let fixture = KernelFixture::new(&options, &view, &arrays_of(&stack));
+    for options in variants {
+        let fixture = KernelFixture::new(options, &view, &arrays_of(&stack));
         let gpu = &fixture.gpu;
         let n_pixels = (view.size_px[0] * view.size_px[1]) as usize;
         gpu.write(&fixture.scratch.gradients, 0, bytemuck::cast_slice(&vec![1.0f32; 12 << 14]));
@@ -606,6 +607,67 @@ fn camera_params_start_at_zero_and_step_by_their_rate() {
         for (param, step) in steps.iter().enumerate() {
             let rate = if (7..11).contains(&param) { 1e-3 } else { 0.0 };
             assert!((step.abs() - rate).abs() < 1e-5, "camera parameter {param} changed by {step}");
+        }
+    }
+}
+
+#[test]
+fn gradients_match_the_twin() {
+    check_short_lists(&adapter_options());
+}
+
+#[test]
+fn gradients_of_long_lists_match_the_twin() {
+    check_long_lists(&adapter_options());
+}
+
+#[test]
+fn pixels_that_end_in_long_lists_match_the_twin() {
+    check_ends_in_long_lists(&adapter_options());
+}
+
+#[test]
+fn hidden_splats_have_no_gradient() {
+    check_hidden_splats(&adapter_options());
+}
+
+/// The same tests with the kernels for GPUs: `rasterize` and `backward` with sums over subgroups.
+mod needs_large_subgroups {
+    use super::*;
+    use crate::gpu::testing::options_with_large_subgroups;
+
+    #[test]
+    fn pictures_match_the_twin() {
+        if let Some(options) = options_with_large_subgroups() {
+            check_pictures(&options);
+        }
+    }
+
+    #[test]
+    fn gradients_match_the_twin() {
+        if let Some(options) = options_with_large_subgroups() {
+            check_short_lists(&[options]);
+        }
+    }
+
+    #[test]
+    fn gradients_of_long_lists_match_the_twin() {
+        if let Some(options) = options_with_large_subgroups() {
+            check_long_lists(&[options]);
+        }
+    }
+
+    #[test]
+    fn pixels_that_end_in_long_lists_match_the_twin() {
+        if let Some(options) = options_with_large_subgroups() {
+            check_ends_in_long_lists(&[options]);
+        }
+    }
+
+    #[test]
+    fn hidden_splats_have_no_gradient() {
+        if let Some(options) = options_with_large_subgroups() {
+            check_hidden_splats(&[options]);
         }
     }
 }

@@ -2,7 +2,8 @@
 //! bit-exact.
 
 use super::{SplatOptions, SplatTrainer, ply};
-use crate::gpu::{Gpu, GpuOptions};
+use crate::gpu::Gpu;
+use crate::gpu::testing::test_gpu;
 use crate::{Aligned, CommonOptions, Method, ModelOptions};
 use calibration::scenes::{Miscalibration, capture, remaining, wrong_extrinsics};
 use calibration::{CameraRefinement, ParamSet};
@@ -37,7 +38,7 @@ fn train_to(model: &mut dyn Method, step: u64) {
 #[test]
 fn wrong_extrinsics_are_corrected_and_resuming_is_exact() {
     const ALIGNMENT_STEP: u64 = 30;
-    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let gpu = test_gpu();
     let miscalibration = Miscalibration { extrinsics: wrong_extrinsics(), ..Miscalibration::none() };
     let keyframes = capture(&miscalibration);
     let mut uninterrupted = new_model(&gpu, &keyframes);

@@ -3,7 +3,8 @@
 use super::SplatTrainer;
 use super::training_tests::{keyframes, options, train};
 use crate::checkpoint::Checkpoint;
-use crate::gpu::{Gpu, GpuOptions};
+use crate::gpu::Gpu;
+use crate::gpu::testing::test_gpu;
 use crate::{Error, Method};
 use keyframe::Keyframe;
 use std::sync::Arc;
@@ -39,7 +40,7 @@ fn assert_same(one: &Checkpoint, other: &Checkpoint) {
 
 #[test]
 fn paused_growth_continues_on_request_and_after_resuming() {
-    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let gpu = test_gpu();
     let keyframes = keyframes(&gpu, true);
     let mut trainer = new_trainer(&gpu, &keyframes[..8], 3000);
     let n_splats = |trainer: &SplatTrainer| trainer.progress().primitives;
@@ -59,7 +60,7 @@ fn paused_growth_continues_on_request_and_after_resuming() {
 
 #[test]
 fn resuming_is_bit_exact() {
-    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let gpu = test_gpu();
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("training.ckpt");
     for with_depth in [true, false] {
@@ -94,7 +95,7 @@ fn resuming_is_bit_exact() {
 
 #[test]
 fn checkpoint_and_training_do_not_affect_each_other() {
-    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let gpu = test_gpu();
     let keyframes = keyframes(&gpu, true);
     let [mut undisturbed, mut watched] = [(); 2].map(|()| new_trainer(&gpu, &keyframes, 3000));
     train(&mut undisturbed, 210);
@@ -111,7 +112,7 @@ fn checkpoint_and_training_do_not_affect_each_other() {
 
 #[test]
 fn different_data_and_invalid_states_are_rejected() {
-    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let gpu = test_gpu();
     let keyframes = keyframes(&gpu, true);
     let mut trainer = new_trainer(&gpu, &keyframes, 500);
     let checkpoint = checkpoint_of(&mut trainer);

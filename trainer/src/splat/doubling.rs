@@ -5,13 +5,9 @@
 //! doublings are therefore tried again after more training, and when many images are new.
 
 use super::schedule::GROWTH_PERIOD;
+use super::trial_steps::TrialSteps;
 use serde::{Deserialize, Serialize};
 
-/// Step of the first trial. Before it, the number of splats grows without trials.
-pub(crate) const DOUBLING_START: u64 = 800;
-/// Steps of each half of a trial. Both halves end just before a densification step, which would lower the scores for
-/// some steps.
-pub(crate) const DOUBLING_STEPS: u64 = 3 * GROWTH_PERIOD;
 /// A rejected doubling is tried again at this multiple of the step at which it was rejected.
 const RETRY_FACTOR: f64 = 1.5;
 /// Maximum share of the planned steps, or of the steps so far if these are more, that are spent on the discarded halves
@@ -34,10 +30,10 @@ pub(crate) struct Doubling {
 
 impl Doubling {
     /// Whether a trial may start at `step`. Trials start only at multiples of [`GROWTH_PERIOD`], where submits end.
-    pub(crate) fn is_due(&self, step: u64, n_planned_steps: u64) -> bool {
+    pub(crate) fn is_due(&self, step: u64, n_planned_steps: u64, steps: &TrialSteps) -> bool {
         let max_discarded = MAX_SHARE * step.max(n_planned_steps) as f64;
-        let is_affordable = self.n_trials == 0 || ((self.n_trials + 1) * DOUBLING_STEPS) as f64 <= max_discarded;
-        step >= DOUBLING_START.max(self.not_before) && step.is_multiple_of(GROWTH_PERIOD) && is_affordable
+        let is_affordable = self.n_trials == 0 || ((self.n_trials + 1) * steps.doubling_half) as f64 <= max_discarded;
+        step >= steps.first_doubling.max(self.not_before) && step.is_multiple_of(GROWTH_PERIOD) && is_affordable
     }
 
     /// Counts a trial that starts.
@@ -69,23 +65,27 @@ mod tests {
 
     const N_PLANNED: u64 = 7000;
 
+    fn steps() -> TrialSteps {
+        TrialSteps::default()
+    }
+
     #[test]
     fn trials_take_a_limited_share_of_the_steps() {
         let mut doubling = Doubling::default();
-        let mut due_at = |steps: std::ops::Range<u64>| {
+        let mut due_at = |range: std::ops::Range<u64>| {
             let mut n = 0;
-            for step in steps {
-                if doubling.is_due(step, N_PLANNED) {
+            for step in range {
+                if doubling.is_due(step, N_PLANNED, &steps()) {
                     doubling.begin();
                     n += 1;
                 }
             }
             n
         };
-        assert_eq!(due_at(0..DOUBLING_START), 0);
-        assert_eq!(due_at(DOUBLING_START..N_PLANNED), 3, "15 % of the planned steps");
+        assert_eq!(due_at(0..steps().first_doubling), 0);
+        assert_eq!(due_at(steps().first_doubling..N_PLANNED), 3, "15 % of the planned steps");
         assert_eq!(due_at(N_PLANNED..4 * N_PLANNED), 10, "15 % of the steps so far");
-        assert!(Doubling::default().is_due(900, 1000), "one trial is always affordable");
+        assert!(Doubling::default().is_due(900, 1000, &steps()), "one trial is always affordable");
     }
 
     #[test]
@@ -93,7 +93,7 @@ mod tests {
         let mut doubling = Doubling::default();
         assert!(doubling.restart(40));
         doubling.reject(1000);
-        let is_due = |doubling: &Doubling, step| doubling.is_due(step, N_PLANNED);
+        let is_due = |doubling: &Doubling, step| doubling.is_due(step, N_PLANNED, &steps());
         assert_eq!([1000, 1400, 1500, 1550].map(|step| is_due(&doubling, step)), [false, false, true, false]);
         assert!((1..=53).all(|n_images| !doubling.restart(n_images)) && !is_due(&doubling, 1000));
         assert!(doubling.restart(54) && is_due(&doubling, 1000));

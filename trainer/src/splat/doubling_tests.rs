@@ -1,12 +1,12 @@
 //! Tests of trials that double the number of splats: useful doublings are accepted, others are rejected, and growth
 //! restarts when new images arrive.
 
-use super::doubling::{DOUBLING_START, DOUBLING_STEPS};
-use super::training_tests::{n_keyframes, noisy, options, train};
+use super::training_tests::{FEW_STEPS, n_keyframes, noisy, options, train};
 use super::trials::CountPolicy;
-use super::{SplatOptions, SplatTrainer};
+use super::{SplatOptions, SplatTrainer, TrialSteps};
 use crate::Method;
-use crate::gpu::{Gpu, GpuOptions};
+use crate::gpu::Gpu;
+use crate::gpu::testing::test_gpu;
 use crate::model_options::ModelOptions;
 use calibration::{Candidate, Trial};
 use keyframe::{Keyframe, Split};
@@ -18,6 +18,7 @@ fn tested_growth(n_planned_steps: u64) -> ModelOptions<SplatOptions> {
         options.specific.count = CountPolicy::TestedGrowth;
         options.specific.max_splats = 8000;
         options.specific.seeds_per_image = Some(60.0);
+        options.specific.trial_steps = FEW_STEPS;
     })
 }
 
@@ -51,14 +52,14 @@ fn with_many_validation_images(keyframes: &[Arc<Keyframe>]) -> Vec<Arc<Keyframe>
 /// result.
 #[test]
 fn useful_doubling_is_accepted_also_after_resuming() {
-    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let gpu = test_gpu();
     let keyframes = with_many_validation_images(&n_keyframes(&gpu, 28, true));
     let run = |stop: Option<u64>| {
-        let mut trainer = new_trainer(&gpu, tested_growth(4500), &keyframes);
-        train(&mut trainer, DOUBLING_START);
+        let mut trainer = new_trainer(&gpu, tested_growth(1500), &keyframes);
+        train(&mut trainer, FEW_STEPS.first_doubling);
         let n_before = trainer.progress().primitives;
         if let Some(n_steps) = stop {
-            train_to_total(&mut trainer, DOUBLING_START + n_steps);
+            train_to_total(&mut trainer, FEW_STEPS.first_doubling + n_steps);
             assert_eq!(trainer.progress().primitives, n_before, "the doubled model is not displayed during the trial");
             let checkpoint = trainer.checkpoint().unwrap().finish().unwrap();
             let untrained;
@@ -68,7 +69,7 @@ fn useful_doubling_is_accepted_also_after_resuming() {
         while doublings(&trainer).is_empty() {
             trainer.step(10).unwrap();
         }
-        let n_left = DOUBLING_START + DOUBLING_STEPS + 20 - trainer.progress().step;
+        let n_left = FEW_STEPS.first_doubling + FEW_STEPS.doubling_half + 20 - trainer.progress().step;
         train(&mut trainer, n_left);
         let reported = doublings(&trainer);
         assert!(reported[0].kept && reported[0].gain_db > 0.1, "{reported:?}");
@@ -76,7 +77,7 @@ fn useful_doubling_is_accepted_also_after_resuming() {
         (reported, trainer.arrays().unwrap())
     };
     let uninterrupted = run(None);
-    for stop in [30, DOUBLING_STEPS + 30] {
+    for stop in [30, FEW_STEPS.doubling_half + 30] {
         assert!(run(Some(stop)) == uninterrupted, "stopped after {stop} steps");
     }
 }
@@ -87,14 +88,19 @@ fn useful_doubling_is_accepted_also_after_resuming() {
 fn useless_doubling_is_rejected_until_images_arrive() {
     const N_EARLY: usize = 28;
     const N_LATE: usize = 24;
-    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let gpu = test_gpu();
     let keyframes = with_many_validation_images(&noisy(&n_keyframes(&gpu, N_EARLY + N_LATE, true)));
     let (early, late) = keyframes.split_at(N_EARLY);
-    let options = tested_growth(1400).with(|options| options.specific.seeds_per_image = Some(400.0));
+    // With fewer steps, the model does not yet represent the noise, and doubling improves it.
+    let steps = TrialSteps::default();
+    let options = tested_growth(1400).with(|options| {
+        options.specific.seeds_per_image = Some(400.0);
+        options.specific.trial_steps = steps;
+    });
     let mut trainer = new_trainer(&gpu, options, early);
-    train(&mut trainer, DOUBLING_START);
+    train(&mut trainer, steps.first_doubling);
     let n_before = trainer.progress().primitives;
-    train(&mut trainer, 2 * DOUBLING_STEPS);
+    train(&mut trainer, 2 * steps.doubling_half);
     let reported = doublings(&trainer);
     assert!(reported.len() == 1 && !reported[0].kept, "{reported:?}");
     // After densification, the model is reduced, and all images are trained on.
@@ -105,7 +111,7 @@ fn useless_doubling_is_rejected_until_images_arrive() {
     train(&mut trainer, 10);
     assert_eq!((trainer.n_active_views(), trainer.trials().len()), (N_EARLY + 4, n_trials), "too few new images");
     late[4..].iter().for_each(|keyframe| trainer.push(keyframe.clone()).unwrap());
-    train(&mut trainer, 2 * DOUBLING_STEPS);
+    train(&mut trainer, 2 * steps.doubling_half);
     let n_active = trainer.n_active_views();
     assert!(n_active > N_EARLY + N_LATE / 2 && n_active < N_EARLY + N_LATE, "{n_active}: some are not trained on");
     assert_eq!(doublings(&trainer).len(), reported.len() + 1, "{:?}", trainer.trials());

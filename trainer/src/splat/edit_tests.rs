@@ -4,7 +4,8 @@ use super::arrays::SplatArrays;
 use super::training_tests::{keyframes, options, pose, request, scene, train};
 use super::{SplatTrainer, file, ply};
 use crate::edits::{Edit, Edits, Floaters};
-use crate::gpu::{Gpu, GpuOptions, f32_of};
+use crate::gpu::testing::test_gpu;
+use crate::gpu::{Gpu, f32_of};
 use crate::method_entry::{ExportRequest, ExportWriter};
 use crate::{Aabb, ChunkLayout, Error, Method, ModelKind, ModelOptions, Picture};
 use kinematics::Transform;
@@ -13,7 +14,7 @@ use nalgebra::Vector3;
 use std::sync::Arc;
 
 fn gpu() -> Arc<Gpu> {
-    Gpu::open(&GpuOptions::default()).unwrap()
+    test_gpu()
 }
 
 fn model_of(arrays: &SplatArrays) -> SplatTrainer {

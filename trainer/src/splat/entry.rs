@@ -82,7 +82,7 @@ fn write(request: &ExportRequest<'_>, format: Format) -> Result<Exported, Error>
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::gpu::GpuOptions;
+    use crate::gpu::testing::test_gpu;
     use crate::splat::arrays::SplatArrays;
     use crate::splat::ply;
 
@@ -100,7 +100,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("large.ply");
         ply::write(&path, &splats).unwrap();
-        let model = load(Gpu::open(&GpuOptions::default()).unwrap(), &path).unwrap();
+        let model = load(test_gpu(), &path).unwrap();
         assert_eq!(model.progress().primitives, n_splats as u64);
     }
 }

@@ -7,20 +7,13 @@
 //! improves the mean score, the search continues from the doubled models. Training on all images is paused meanwhile.
 
 use super::snapshot::Snapshot;
+use super::trial_steps::TrialSteps;
 use super::trials::ImageId;
 use calibration::{Candidate, Trial};
 use serde::{Deserialize, Serialize};
 
 /// From this number of images on, the number of splats is not limited.
 pub(crate) const FEW_IMAGES: usize = 40;
-/// Step at which the search starts. Earlier, the models are too coarse for a decision.
-pub(crate) const SEARCH_START: u64 = 800;
-/// Steps that the model on all images is trained for between a change of the images and the search.
-pub(crate) const SEARCH_PAUSE: u64 = 500;
-/// Maximum number of steps that train the model of a fold before the first comparison.
-pub(crate) const MAX_WARM_UP: u64 = 2 * SEARCH_START;
-/// Steps that train each of the two models of a comparison.
-pub(crate) const COMPARED_STEPS: u64 = 250;
 /// Maximum number of folds.
 const MAX_FOLDS: usize = 3;
 /// A new search starts when the number of images has grown by this factor.
@@ -31,7 +24,7 @@ const NEW_SEARCH_GROWTH: f64 = 1.25;
 pub(crate) enum GrowthSearch {
     /// The number of splats is not limited.
     Off,
-    /// The search starts at [`SEARCH_START`] or later.
+    /// The search starts at [`TrialSteps::search`] or later.
     Waiting {
         /// Step before which it does not start.
         not_before: u64,
@@ -113,24 +106,24 @@ pub(crate) fn n_folds(n_images: usize) -> usize {
 }
 
 /// Number of steps of the first round of a search that starts at `step`: see [`FoldModels::n_steps`].
-pub(crate) fn n_steps_of_first_round(step: u64, n_folds: usize) -> u64 {
-    n_folds as u64 * (step.min(MAX_WARM_UP) + 2 * COMPARED_STEPS)
+pub(crate) fn n_steps_of_first_round(step: u64, n_folds: usize, steps: &TrialSteps) -> u64 {
+    n_folds as u64 * (step.min(steps.max_warm_up()) + 2 * steps.comparison)
 }
 
 impl FoldModels {
     /// Number of steps left in this round, and total number of steps of the search up to the end of this round.
-    pub(crate) fn n_steps(&self, step: u64) -> (u64, u64) {
-        let warm_up = self.main.schedule.step.min(MAX_WARM_UP);
+    pub(crate) fn n_steps(&self, step: u64, steps: &TrialSteps) -> (u64, u64) {
+        let warm_up = self.main.schedule.step.min(steps.max_warm_up());
         let n_folds = self.folds.len() as u64;
-        let of_fold = 2 * COMPARED_STEPS + if self.trials.is_empty() { warm_up } else { 0 };
+        let of_fold = 2 * steps.comparison + if self.trials.is_empty() { warm_up } else { 0 };
         let after_phase = match self.phase {
-            FoldPhase::WarmUp => 2 * COMPARED_STEPS,
-            FoldPhase::Baseline => COMPARED_STEPS,
+            FoldPhase::WarmUp => 2 * steps.comparison,
+            FoldPhase::Baseline => steps.comparison,
             FoldPhase::Variant => 0,
         };
         let n_later_folds = n_folds - 1 - self.fold_ix as u64;
         let n_left = self.until.saturating_sub(step) + after_phase + n_later_folds * of_fold;
-        (n_left, n_folds * (warm_up + (self.trials.len() as u64 + 1) * 2 * COMPARED_STEPS))
+        (n_left, n_folds * (warm_up + (self.trials.len() as u64 + 1) * 2 * steps.comparison))
     }
 }
 
@@ -171,10 +164,10 @@ impl GrowthSearch {
     }
 
     /// Steps until the phase of a running search ends, or until a search may start.
-    pub(crate) fn steps_left(&self, step: u64) -> u64 {
+    pub(crate) fn steps_left(&self, step: u64, steps: &TrialSteps) -> u64 {
         match self {
-            Self::Waiting { not_before } if step < SEARCH_START.max(*not_before) => {
-                SEARCH_START.max(*not_before) - step
+            Self::Waiting { not_before } if step < steps.search.max(*not_before) => {
+                steps.search.max(*not_before) - step
             }
             Self::Running(models) => models.until.saturating_sub(step).max(1),
             _ => u64::MAX,
@@ -183,11 +176,11 @@ impl GrowthSearch {
 
     /// Postpones a search that has not started at `step`, because the images have changed. Otherwise, if images arrived
     /// often, training on all images would always be paused.
-    pub(crate) fn postpone(&mut self, step: u64) {
+    pub(crate) fn postpone(&mut self, step: u64, steps: &TrialSteps) {
         if let Self::Waiting { not_before } = self
-            && step >= SEARCH_START
+            && step >= steps.search
         {
-            *not_before = step + SEARCH_PAUSE;
+            *not_before = step + steps.search_pause;
         }
     }
 

@@ -43,6 +43,7 @@ pub mod spz;
 mod trainer;
 #[cfg(test)]
 mod training_tests;
+mod trial_steps;
 #[cfg(test)]
 mod trial_tests;
 mod trials;
@@ -52,5 +53,6 @@ mod work_counts;
 pub(crate) use entry::ENTRY;
 pub use options::SplatOptions;
 pub use trainer::SplatTrainer;
+pub use trial_steps::TrialSteps;
 pub use trials::CountPolicy;
 pub use work_counts::WorkCounts;

@@ -4,7 +4,8 @@ use super::SplatTrainer;
 use super::cloud::synthetic_cloud;
 use super::training_tests::{keyframes, options, test_psnr, train};
 use crate::Method;
-use crate::gpu::{Gpu, GpuOptions, f32_of};
+use crate::gpu::f32_of;
+use crate::gpu::testing::test_gpu;
 use keyframe::{DepthMap, Keyframe};
 use kinematics::{Stamp, Transform, Twist};
 use nalgebra::{Point3, Vector3};
@@ -14,7 +15,7 @@ use std::sync::Arc;
 #[test]
 fn invalid_keyframes_do_not_affect_training() {
     const N_STEPS: u64 = 120;
-    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let gpu = test_gpu();
     let valid_keyframes = keyframes(&gpu, true);
     let with_depth = |of: fn(usize, f32) -> f32| {
         let corrupted = valid_keyframes[1].as_ref().clone();
@@ -64,7 +65,7 @@ fn invalid_keyframes_do_not_affect_training() {
 /// Extreme splats that a file may contain: on the camera plane, with a zero quaternion, huge, or almost transparent.
 #[test]
 fn invalid_splats_stay_finite_in_training() {
-    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let gpu = test_gpu();
     let valid_keyframes = keyframes(&gpu, true);
     let mut arrays = synthetic_cloud(200, 5);
     let center = valid_keyframes[1].world_from_camera.translation.vector;

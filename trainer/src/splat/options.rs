@@ -1,5 +1,6 @@
 //! Options of the splat model.
 
+use super::trial_steps::TrialSteps;
 use super::trials::CountPolicy;
 use crate::model_options::{MethodOptions, ModelOptions};
 use serde::{Deserialize, Serialize};
@@ -38,6 +39,9 @@ pub struct SplatOptions {
     pub coarse_steps: Option<[u64; 2]>,
     /// Maximum number of splats added for one depth image. `None` selects a default, which is lower on a CPU.
     pub seeds_per_image: Option<f64>,
+    /// When parts of the model are tested.
+    #[serde(default)]
+    pub trial_steps: TrialSteps,
 }
 
 impl MethodOptions for SplatOptions {
@@ -59,6 +63,7 @@ impl Default for SplatOptions {
             drop_frac: 0.2,
             coarse_steps: None,
             seeds_per_image: None,
+            trial_steps: TrialSteps::default(),
         }
     }
 }

@@ -101,7 +101,7 @@ impl SplatTrainer {
             schedule: Schedule::new(options.common.n_planned_steps),
             views: ViewSet::new(&options, is_software),
             seeding: Seeding::new(&options, is_software),
-            trials: SplatTrials::new(&options.common.cameras, options.specific.count),
+            trials: SplatTrials::new(&options.common.cameras, options.specific.count, options.specific.trial_steps),
             growth_search: GrowthSearch::new(options.specific.count == CountPolicy::Tested),
             skipped: SkippedSteps::default(),
             saved_corrections: BTreeMap::new(),

@@ -2,9 +2,10 @@
 
 use super::arrays::SplatArrays;
 use super::cloud::synthetic_cloud;
-use super::{SplatOptions, SplatTrainer};
+use super::{SplatOptions, SplatTrainer, TrialSteps};
 use crate::eval::{PixelPair, psnr};
-use crate::gpu::{Gpu, GpuOptions, f32s_of};
+use crate::gpu::testing::test_gpu;
+use crate::gpu::{Gpu, f32s_of};
 use crate::model_options::{CommonOptions, ModelOptions};
 use crate::view::Camera;
 use crate::{Aabb, Method, Packing, Projection, RenderRequest, Rendered};
@@ -16,6 +17,19 @@ use std::sync::Arc;
 
 const SIZE_PX: [u32; 2] = [96, 80];
 const FOCAL_PX: f64 = 90.0;
+
+/// A quarter of the usual steps of trials: enough for decisions on small images.
+pub(super) const FEW_STEPS: TrialSteps = TrialSteps {
+    first_trial: 125,
+    trial_half: 60,
+    per_image: 1,
+    max_trial_half: 300,
+    first_doubling: 200,
+    doubling_half: 100,
+    search: 200,
+    search_pause: 125,
+    comparison: 60,
+};
 
 /// The inside of a colorful sphere: a closed surface with well-defined depth.
 pub(super) fn scene() -> SplatArrays {
@@ -169,7 +183,7 @@ pub(super) fn test_psnr(trainer: &mut SplatTrainer, keyframes: &[Arc<Keyframe>])
 
 #[test]
 fn training_predicts_test_views_and_is_reproducible() {
-    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let gpu = test_gpu();
     let keyframes = keyframes(&gpu, true);
     let run = |seed| {
         let mut trainer = SplatTrainer::new(gpu.clone(), options().with(|options| options.common.seed = seed)).unwrap();
@@ -192,7 +206,7 @@ fn training_predicts_test_views_and_is_reproducible() {
 #[test]
 fn image_memory_limit_holds_and_does_not_change_the_result() {
     const LEVEL_0_BYTES: u64 = 8 * SIZE_PX[0] as u64 * SIZE_PX[1] as u64;
-    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let gpu = test_gpu();
     let keyframes = n_keyframes(&gpu, 20, true);
     let n_train = keyframes.iter().filter(|keyframe| keyframe.split == Split::Train).count() as u64;
     let run = |max_bytes: u64, train: fn(&mut SplatTrainer, u64)| {
@@ -232,7 +246,7 @@ fn image_memory_limit_holds_and_does_not_change_the_result() {
 
 #[test]
 fn trains_without_depth_from_random_points() {
-    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let gpu = test_gpu();
     let keyframes = keyframes(&gpu, false);
     let mut trainer = SplatTrainer::new(gpu, options()).unwrap();
     for keyframe in &keyframes {
@@ -249,7 +263,7 @@ fn trains_without_depth_from_random_points() {
 #[test]
 fn areas_outside_a_depth_band_are_seeded_at_its_depth() {
     const SHARE: u32 = 4;
-    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let gpu = test_gpu();
     let with_band = |keyframe: Arc<Keyframe>| {
         let full = keyframe.depth.as_ref().unwrap();
         let size_px = full.size_px.map(|side| side / SHARE);
@@ -290,7 +304,7 @@ fn areas_outside_a_depth_band_are_seeded_at_its_depth() {
 /// A live scan may last longer than planned. Areas that arrive late must still get splats.
 #[test]
 fn late_keyframe_resumes_growth() {
-    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let gpu = test_gpu();
     let keyframes = keyframes(&gpu, true);
     let mut trainer = SplatTrainer::new(gpu, options().with(|options| options.specific.max_splats = 8_000)).unwrap();
     for keyframe in &keyframes {
@@ -311,7 +325,7 @@ fn late_keyframe_resumes_growth() {
 fn crop_box_limits_the_picture() {
     /// More than the radius of a disc.
     const MARGIN_M: f64 = 2.0;
-    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let gpu = test_gpu();
     let mut model = SplatTrainer::from_arrays(gpu, ModelOptions::default(), &scene()).unwrap();
     let whole = request(pose(0));
     let picture = model.render(&whole).unwrap();
@@ -336,7 +350,7 @@ fn crop_box_limits_the_picture() {
 /// The newest image must not wait for the next one.
 #[test]
 fn newest_keyframe_is_trained_on() {
-    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let gpu = test_gpu();
     let keyframes = keyframes(&gpu, true);
     let mut trainer = SplatTrainer::new(gpu, options()).unwrap();
     trainer.push(keyframes[1].clone()).unwrap();
@@ -374,7 +388,7 @@ fn trainer_with_lens_trial(keyframes: &[Arc<Keyframe>], gpu: Arc<Gpu>, max_splat
 #[test]
 fn wrong_lens_is_corrected_by_trial() {
     const FOCAL_ERROR: f64 = 1.1;
-    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let gpu = test_gpu();
     let true_keyframes = n_keyframes(&gpu, 60, true);
     let miscalibrated = true_keyframes.iter().map(|keyframe| {
         let focal_px = keyframe.focal_px.map(|focal| FOCAL_ERROR * focal);
@@ -395,7 +409,7 @@ fn wrong_lens_is_corrected_by_trial() {
 
 #[test]
 fn running_trial_is_not_saved_but_repeated() {
-    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let gpu = test_gpu();
     let keyframes = n_keyframes(&gpu, 36, true);
     let mut trainer = trainer_with_lens_trial(&keyframes, gpu, 300);
     train(&mut trainer, 750);
@@ -413,7 +427,7 @@ fn running_trial_is_not_saved_but_repeated() {
 /// Black splats are invisible in front of a black background, but they must still occlude and have a depth.
 #[test]
 fn black_objects_stay_opaque() {
-    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let gpu = test_gpu();
     let mut trainer = SplatTrainer::new(gpu.clone(), options()).unwrap();
     let keyframes = keyframes(&gpu, true);
     for keyframe in &keyframes {
@@ -433,7 +447,7 @@ fn black_objects_stay_opaque() {
 
 #[test]
 fn byte_limit_holds() {
-    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let gpu = test_gpu();
     let keyframes = keyframes(&gpu, true);
     let base = options();
     let cap_bytes = 500 * base.specific.bytes_per_splat();
@@ -448,7 +462,7 @@ fn byte_limit_holds() {
 
 #[test]
 fn scratch_memory_grows_when_a_view_needs_more() {
-    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let gpu = test_gpu();
     let mut arrays = scene();
     arrays.log_scales.iter_mut().for_each(|scale| *scale = [0.5; 3]); // Every splat covers every tile.
     arrays.opacity_logits.iter_mut().for_each(|opacity| *opacity = -3.0);
@@ -472,7 +486,7 @@ fn scratch_memory_grows_when_a_view_needs_more() {
 
 #[test]
 fn equirectangular_agrees_with_pinhole() {
-    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let gpu = test_gpu();
     let mut trainer = SplatTrainer::from_arrays(gpu, ModelOptions::default(), &scene()).unwrap();
     let around = trainer
         .render(&RenderRequest { size_px: [512, 256], projection: Projection::Equirectangular, ..request(pose(2)) })
@@ -501,7 +515,7 @@ fn equirectangular_agrees_with_pinhole() {
 /// The number of steps per submit depends on timing, so it must not affect splats or camera parameters.
 #[test]
 fn submit_length_does_not_change_the_result() {
-    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let gpu = test_gpu();
     let keyframes = keyframes(&gpu, true);
     let params = ParamSet::EXTRINSICS | ParamSet::TIME_OFFSET;
     let learned = |train: fn(&mut SplatTrainer, u64)| {
@@ -519,7 +533,7 @@ fn submit_length_does_not_change_the_result() {
 /// With a viewer, submits are shorter and images are uploaded in smaller batches. This must not change the result.
 #[test]
 fn viewers_shorten_submits_but_do_not_change_the_result() {
-    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let gpu = test_gpu();
     let keyframes = keyframes(&gpu, true);
     let learned = |watched: bool| {
         let mut trainer = SplatTrainer::new(gpu.clone(), options()).unwrap();
@@ -546,7 +560,7 @@ fn viewers_shorten_submits_but_do_not_change_the_result() {
 /// Submit lengths must not affect the end of a trial, after which validation images become training images.
 #[test]
 fn submit_length_does_not_change_the_result_of_a_trial() {
-    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let gpu = test_gpu();
     let keyframes = n_keyframes(&gpu, 36, true);
     let learned = |train: fn(&mut SplatTrainer, u64)| {
         let mut trainer = trainer_with_lens_trial(&keyframes, gpu.clone(), 300);
@@ -562,7 +576,7 @@ fn submit_length_does_not_change_the_result_of_a_trial() {
 #[test]
 fn buffer_overflow_does_not_change_the_result() {
     const N_STEPS: u64 = 90;
-    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let gpu = test_gpu();
     let keyframes = keyframes(&gpu, false);
     let mut cloud = synthetic_cloud(4000, 5);
     cloud.log_scales.fill([1.5; 3]); // Every splat covers every image, which overflows the buffers at full resolution.
@@ -585,7 +599,7 @@ fn buffer_overflow_does_not_change_the_result() {
 #[test]
 fn queued_pictures_equal_rendered_ones() {
     const MAX_MEAN_DIFFERENCE: f64 = 1.0; // JPEG error at quality 95, in units of 1/255.
-    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let gpu = test_gpu();
     let mut cloud = synthetic_cloud(2000, 5);
     cloud.log_scales.fill([1.5; 3]); // Every splat covers every image, which overflows the buffers.
     let packing = Packing { jpeg_quality: Some(95), depth: true };

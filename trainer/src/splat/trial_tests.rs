@@ -1,28 +1,31 @@
 //! Tests of trials while keyframes arrive and are removed: both halves train on the same data, no seed is lost, and a
 //! checkpoint contains the whole trial.
 
-use super::SplatTrainer;
 use super::training_tests::{n_keyframes, options};
-use super::trials::{MAX_SCORED, TRIAL_START};
+use super::trials::MAX_SCORED;
+use super::{SplatTrainer, TrialSteps};
 use crate::Method;
 use crate::checkpoint::Checkpoint;
-use crate::gpu::{Gpu, GpuOptions};
+use crate::gpu::Gpu;
+use crate::gpu::testing::test_gpu;
 use calibration::{CameraRefinement, ParamSet, Trial};
 use keyframe::{Keyframe, Split};
 use std::sync::Arc;
 
+const START: u64 = 250;
 /// Steps of each half of a trial of shared parameters.
-const HALF: u64 = 250;
-const END: u64 = TRIAL_START + 2 * HALF;
+const HALF: u64 = 125;
+const END: u64 = START + 2 * HALF;
 
 fn trainer_with_candidate(gpu: &Arc<Gpu>, candidate: ParamSet) -> SplatTrainer {
     // The splat count changes only when seeds are added.
     let options = options().with(|options| {
         options.common.cameras = CameraRefinement::Try(vec![candidate]);
-        options.common.n_planned_steps = 1500;
+        options.common.n_planned_steps = 750;
         options.specific.growth_frac = 0.0;
         options.specific.max_splats = 20_000;
         options.specific.seeds_per_image = Some(300.0);
+        options.specific.trial_steps = TrialSteps { first_trial: START, trial_half: HALF, ..TrialSteps::default() };
     });
     SplatTrainer::new(gpu.clone(), options).unwrap()
 }
@@ -57,9 +60,9 @@ fn trial_with_arrivals(gpu: &Arc<Gpu>, candidate: ParamSet, keyframes: &[Arc<Key
     let (first_half, second_half) = late.split_at(8);
     let mut trainer = trainer_with_candidate(gpu, candidate);
     early.iter().for_each(|keyframe| trainer.push(keyframe.clone()).unwrap());
-    for (begin, arriving) in [(TRIAL_START, first_half), (TRIAL_START + HALF, second_half)] {
+    for (begin, arriving) in [(START, first_half), (START + HALF, second_half)] {
         for (ix, keyframe) in arriving.iter().enumerate() {
-            train_to(&mut trainer, begin + 20 + 21 * ix as u64);
+            train_to(&mut trainer, begin + 10 + 10 * ix as u64);
             trainer.push(keyframe.clone()).unwrap();
         }
     }
@@ -77,7 +80,7 @@ fn assert_all_seeds_kept(trainer: &SplatTrainer, keyframes: &[Arc<Keyframe>]) {
 
 #[test]
 fn no_op_trial_has_zero_gain_while_keyframes_arrive() {
-    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let gpu = test_gpu();
     let keyframes = around(&gpu);
     let trainer = trial_with_arrivals(&gpu, ParamSet::empty(), &keyframes);
     let [Trial { gain_db, standard_error_db, n_images, kept, .. }] = trainer.trials() else {
@@ -90,7 +93,7 @@ fn no_op_trial_has_zero_gain_while_keyframes_arrive() {
 
 #[test]
 fn accepted_trial_keeps_seeds_of_arrived_keyframes() {
-    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let gpu = test_gpu();
     let miscalibrated: Vec<_> = around(&gpu)
         .iter()
         .map(|keyframe| {
@@ -106,7 +109,7 @@ fn accepted_trial_keeps_seeds_of_arrived_keyframes() {
 #[test]
 fn both_halves_score_the_same_images() {
     const N_FIRST: usize = 20;
-    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let gpu = test_gpu();
     let keyframes = n_keyframes(&gpu, 60, true);
     let train = keyframes.iter().step_by(5).map(|keyframe| with_split(keyframe, Split::Train));
     let validation: Vec<_> =
@@ -116,7 +119,7 @@ fn both_halves_score_the_same_images() {
     train.chain(early.iter().cloned()).for_each(|keyframe| trainer.push(keyframe).unwrap());
     // Validation keyframes arrive in both halves, and each half loses one of the scored keyframes.
     for (ix, keyframe) in late.iter().enumerate() {
-        train_to(&mut trainer, TRIAL_START + 10 + 24 * ix as u64);
+        train_to(&mut trainer, START + 5 + 12 * ix as u64);
         trainer.push(keyframe.clone()).unwrap();
         match ix {
             3 => trainer.remove("test", early[2].stamp).unwrap(),
@@ -134,16 +137,16 @@ fn both_halves_score_the_same_images() {
 
 #[test]
 fn resuming_in_either_trial_half_is_bit_exact() {
-    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let gpu = test_gpu();
     let keyframes = n_keyframes(&gpu, 42, true);
     // Arrivals of keyframes and interruptions of training, in total updates.
-    let arrivals: Vec<u64> = (0..42).map(|ix| if ix < 36 { 0 } else { TRIAL_START - 60 + 120 * (ix - 35) }).collect();
-    let stops = [TRIAL_START - 10, TRIAL_START + 70, TRIAL_START + HALF + 30, TRIAL_START + HALF + 140, END + 20];
+    let arrivals: Vec<u64> = (0..42).map(|ix| if ix < 36 { 0 } else { START - 30 + 60 * (ix - 35) }).collect();
+    let stops = [START - 5, START + 35, START + HALF + 15, START + HALF + 70, END + 10];
     let run = |stops: &[u64]| {
         let mut trainer = trainer_with_candidate(&gpu, lens());
         let mut n_taken_before = 0; // Reverted updates, which a checkpoint does not count.
         let mut n_pushed = 0;
-        let times: std::collections::BTreeSet<u64> = arrivals.iter().chain(stops).copied().chain([END + 40]).collect();
+        let times: std::collections::BTreeSet<u64> = arrivals.iter().chain(stops).copied().chain([END + 20]).collect();
         for time in times {
             train_to(&mut trainer, time - n_taken_before);
             while n_pushed < arrivals.len() && arrivals[n_pushed] <= time {
@@ -153,7 +156,7 @@ fn resuming_in_either_trial_half_is_bit_exact() {
             if stops.contains(&time) {
                 let checkpoint = trainer.checkpoint().unwrap().finish().unwrap();
                 let n_other_arrays = checkpoint.arrays.iter().filter(|array| array.name.starts_with("other_")).count();
-                let is_in_trial = (TRIAL_START..END).contains(&time);
+                let is_in_trial = (START..END).contains(&time);
                 assert_eq!(n_other_arrays > 0, is_in_trial, "at {time}");
                 let untrained;
                 (trainer, untrained) = SplatTrainer::resume(gpu.clone(), &checkpoint, &keyframes[..n_pushed]).unwrap();

@@ -10,8 +10,9 @@
 
 use super::arrival_gains::ArrivalGains;
 use super::buffers::SplatBuffers;
-use super::doubling::{DOUBLING_START, DOUBLING_STEPS, Doubling};
+use super::doubling::Doubling;
 use super::snapshot::Snapshot;
+use super::trial_steps::TrialSteps;
 use crate::Error;
 use crate::gpu::{Buffer, Gpu};
 use calibration::{CameraRefinement, Candidate, MIN_VALIDATION_IMAGES, ParamSet, Trial};
@@ -21,13 +22,6 @@ use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 
-/// Step of the first trial. Before this step, the model is too coarse for a decision.
-pub(crate) const TRIAL_START: u64 = 500;
-/// Steps of each half of a trial. Trials of per-image parameters may take more steps.
-const SHARED_STEPS: u64 = 250;
-/// Steps per image in each half of a trial of per-image parameters, up to [`MAX_STEPS`] in total.
-const STEPS_PER_IMAGE: u64 = 4;
-const MAX_STEPS: u64 = 1200;
 /// Maximum total loss of the reductions accepted since the last doubling, dB.
 const MAX_TOTAL_LOSS_DB: f64 = 0.15;
 /// Maximum number of validation keyframes that are scored.
@@ -108,6 +102,7 @@ pub(crate) enum CountState {
 /// State of the trials.
 #[derive(Debug)]
 pub(crate) struct SplatTrials {
+    pub(crate) steps: TrialSteps,
     candidates: VecDeque<ParamSet>,
     count: CountState,
     /// Present if growth depends on trials.
@@ -238,7 +233,7 @@ impl RunningTrial {
 }
 
 impl SplatTrials {
-    pub(crate) fn new(cameras: &CameraRefinement, count: CountPolicy) -> Self {
+    pub(crate) fn new(cameras: &CameraRefinement, count: CountPolicy, steps: TrialSteps) -> Self {
         let doubling = (count == CountPolicy::TestedGrowth).then(Doubling::default);
         let candidates: VecDeque<ParamSet> = cameras.candidates().iter().copied().collect();
         let count = match count {
@@ -248,6 +243,7 @@ impl SplatTrials {
         let is_finished = candidates.is_empty() && count == CountState::ToCap;
         let trial_phase = if is_finished { SplatTrialPhase::Finished } else { SplatTrialPhase::Waiting };
         Self {
+            steps,
             candidates,
             count,
             doubling,
@@ -267,7 +263,7 @@ impl SplatTrials {
 
     /// Whether regular densification may add splats at this step.
     pub(crate) fn may_grow(&self, step: u64) -> bool {
-        if self.doubling.is_some() && step >= DOUBLING_START {
+        if self.doubling.is_some() && step >= self.steps.first_doubling {
             return false;
         }
         let is_halving = matches!(self.running_trial(), Some(RunningTrial { candidate: Candidate::Halved { .. }, .. }));
@@ -288,12 +284,12 @@ impl SplatTrials {
     }
 
     fn next_due(&self, context: TrialContext) -> Due {
-        if context.step < TRIAL_START {
+        if context.step < self.steps.first_trial {
             return Due::Nothing;
         }
         if self.validation.len() < MIN_VALIDATION_IMAGES {
             // Wait for more images, but not indefinitely.
-            let waits = context.step < 2 * TRIAL_START || (self.doubling.is_some() && !context.is_mature);
+            let waits = context.step < 2 * self.steps.first_trial || (self.doubling.is_some() && !context.is_mature);
             return if waits { Due::Nothing } else { Due::ReleaseValidation };
         }
         if let Some(params) = self.candidates.front() {
@@ -305,7 +301,9 @@ impl SplatTrials {
             to: context.n_splats.saturating_mul(2).min(context.max_splats),
         };
         let is_doubling_due = context.n_splats < context.max_splats
-            && self.doubling.is_some_and(|doubling| doubling.is_due(context.step, context.n_planned_steps));
+            && self
+                .doubling
+                .is_some_and(|doubling| doubling.is_due(context.step, context.n_planned_steps, &self.steps));
         let lower = Candidate::ShDegree { from: context.sh_degree, to: self.degree };
         match self.count {
             CountState::ToCap => Due::ReleaseValidation,
@@ -321,7 +319,7 @@ impl SplatTrials {
     /// Number of steps until work may be due again.
     pub(crate) fn steps_left(&self, step: u64) -> u64 {
         match &self.trial_phase {
-            SplatTrialPhase::Waiting if step < TRIAL_START => TRIAL_START - step,
+            SplatTrialPhase::Waiting if step < self.steps.first_trial => self.steps.first_trial - step,
             SplatTrialPhase::Running(trial) => trial.until.min(trial.next_arrival_step()).saturating_sub(step).max(1),
             _ => u64::MAX,
         }
@@ -371,10 +369,10 @@ impl SplatTrials {
     pub(crate) fn begin(&mut self, candidate: Candidate, from: Snapshot, n_views: usize) {
         let n_steps = match candidate {
             Candidate::Cameras(params) if params.intersects(ParamSet::IMAGE_POSES | ParamSet::IMAGE_GAINS) => {
-                (STEPS_PER_IMAGE * n_views as u64).clamp(SHARED_STEPS, MAX_STEPS)
+                (self.steps.per_image * n_views as u64).clamp(self.steps.trial_half, self.steps.max_trial_half)
             }
-            Candidate::Doubled { .. } => DOUBLING_STEPS,
-            _ => SHARED_STEPS,
+            Candidate::Doubled { .. } => self.steps.doubling_half,
+            _ => self.steps.trial_half,
         };
         if matches!(candidate, Candidate::Doubled { .. }) {
             self.doubling.iter_mut().for_each(Doubling::begin);
@@ -591,7 +589,7 @@ mod tests {
 
     #[test]
     fn no_trials_without_candidates() {
-        let trials = SplatTrials::new(&CameraRefinement::default(), CountPolicy::ToCap);
+        let trials = SplatTrials::new(&CameraRefinement::default(), CountPolicy::ToCap, TrialSteps::default());
         assert!(!trials.holds_validation() && trials.may_grow(0));
         assert_eq!(trials.due(TrialContext { step: 10_000, is_mature: true, ..CONTEXT }), Due::Nothing);
     }
@@ -599,11 +597,11 @@ mod tests {
     #[test]
     fn too_few_validation_images_are_released() {
         for count in [CountPolicy::ToCap, CountPolicy::Tested] {
-            let trials = SplatTrials::new(&CameraRefinement::Try(vec![poses()]), count);
+            let trials = SplatTrials::new(&CameraRefinement::Try(vec![poses()]), count, TrialSteps::default());
             assert!(trials.holds_validation());
             let due = |step| trials.due(TrialContext { step, ..CONTEXT });
-            assert_eq!(due(TRIAL_START), Due::Nothing);
-            assert_eq!(due(2 * TRIAL_START), Due::ReleaseValidation);
+            assert_eq!(due(TrialSteps::default().first_trial), Due::Nothing);
+            assert_eq!(due(2 * TrialSteps::default().first_trial), Due::ReleaseValidation);
         }
     }
 }

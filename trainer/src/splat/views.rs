@@ -178,7 +178,7 @@ impl TrainView {
 
     /// The lens, if any, and a level. The images of the level must be uploaded.
     pub(crate) fn ready_level(&self, level: usize) -> Result<(Option<&Buffer>, &Level), Error> {
-        Ok((self.lens.as_ref(), self.levels[level].as_ref().ok_or(Error::DeviceLost)?))
+        Ok((self.lens.as_ref(), self.levels[level].as_ref().ok_or_else(not_uploaded)?))
     }
 
     /// Returns `level`, or a finer level if a side of the image would be smaller than a tile.
@@ -362,4 +362,9 @@ fn downscaled_depth(keyframe: &Keyframe, size_px: [u32; 2], level: u32) -> Arc<[
         .flat_map(|y| (0..size_px[0] as usize).map(move |x| (x, y)))
         .map(|(x, y)| full[(y * edge + middle) * width + x * edge + middle])
         .collect()
+}
+
+/// The error if a view is used before its image is uploaded.
+fn not_uploaded() -> Error {
+    Error::internal("a view was used before its image was uploaded")
 }

@@ -12,7 +12,7 @@ use super::params::MeshVertex;
 use super::reference::{self, BlockTriangles, Ray, Vertex, VoxelBlocks};
 use super::tests::fuse_all;
 use crate::edits::{Edit, Edits};
-use crate::gpu::{Gpu, GpuOptions};
+use crate::gpu::testing::test_gpu;
 use crate::mismatches::Mismatches;
 use crate::model_options::ModelOptions;
 use crate::test_scenes::{self as scenes, FOCAL_PX, PRINCIPAL_PX, SIZE_PX};
@@ -29,17 +29,13 @@ const COLOR_ABS: f64 = 5e-4;
 /// Fraction of voxels and pixels for which f32 rounding may change a decision.
 const MAX_UNDECIDED_FRAC: f64 = 2e-3;
 
-fn gpu_variants() -> [GpuOptions; 2] {
-    [GpuOptions::default(), GpuOptions { optional_features: false, ..GpuOptions::default() }]
-}
-
 fn scene() -> Vec<Arc<Keyframe>> {
     let at = Point3::new(0.3, -0.2, 0.1);
     scenes::ring(&[scenes::ball(at), scenes::floor()], at, 3)
 }
 
-fn fused(options: &GpuOptions, keyframes: &[Arc<Keyframe>]) -> (Blocks, VoxelGrid, TsdfModel) {
-    let gpu = Gpu::open(options).unwrap();
+fn fused(keyframes: &[Arc<Keyframe>]) -> (Blocks, VoxelGrid, TsdfModel) {
+    let gpu = test_gpu();
     let mut model = TsdfModel::new(gpu, scenes::options()).unwrap();
     for keyframe in keyframes {
         model.push(keyframe.clone()).unwrap();
@@ -51,32 +47,28 @@ fn fused(options: &GpuOptions, keyframes: &[Arc<Keyframe>]) -> (Blocks, VoxelGri
 
 #[test]
 fn blocks_are_allocated_along_rays() {
-    for options in gpu_variants() {
-        let (got, voxel_grid, _) = fused(&options, &scene()[..1]);
-        let depth = scene()[0].depth.clone().unwrap();
-        let readings = reference::readings(&depth, &voxel_grid);
-        let required = reference::required_blocks(&depth, &readings, &voxel_grid, 1e-3);
-        let got: BTreeSet<GridCoord> = got.into_keys().collect();
-        assert!(required.definite.len() > 100, "{}", required.definite.len());
-        let missing: Vec<_> = required.definite.difference(&got).collect();
-        assert!(missing.is_empty(), "{missing:?}");
-        let surplus: Vec<_> = got.difference(&required.possible).collect();
-        assert!(surplus.is_empty(), "{surplus:?}");
-    }
+    let (got, voxel_grid, _) = fused(&scene()[..1]);
+    let depth = scene()[0].depth.clone().unwrap();
+    let readings = reference::readings(&depth, &voxel_grid);
+    let required = reference::required_blocks(&depth, &readings, &voxel_grid, 1e-3);
+    let got: BTreeSet<GridCoord> = got.into_keys().collect();
+    assert!(required.definite.len() > 100, "{}", required.definite.len());
+    let missing: Vec<_> = required.definite.difference(&got).collect();
+    assert!(missing.is_empty(), "{missing:?}");
+    let surplus: Vec<_> = got.difference(&required.possible).collect();
+    assert!(surplus.is_empty(), "{surplus:?}");
 }
 
 #[test]
 fn fused_voxels_match_twin() {
-    for options in gpu_variants() {
-        let keyframes = scene();
-        let (got, twin, voxel_grid) = fused_with_twin(&options, &keyframes);
-        compare(&got, &twin, &voxel_grid);
-    }
+    let keyframes = scene();
+    let (got, twin, voxel_grid) = fused_with_twin(&keyframes);
+    compare(&got, &twin, &voxel_grid);
 }
 
 /// Fuses the keyframes one after the other, on the GPU and in the twin, which allocates the same blocks.
-fn fused_with_twin(options: &GpuOptions, keyframes: &[Arc<Keyframe>]) -> (Blocks, VoxelBlocks, VoxelGrid) {
-    let mut model = TsdfModel::new(Gpu::open(options).unwrap(), scenes::options()).unwrap();
+fn fused_with_twin(keyframes: &[Arc<Keyframe>]) -> (Blocks, VoxelBlocks, VoxelGrid) {
+    let mut model = TsdfModel::new(test_gpu(), scenes::options()).unwrap();
     let mut twin = VoxelBlocks::new();
     for keyframe in keyframes {
         model.push(keyframe.clone()).unwrap();
@@ -126,10 +118,8 @@ fn carving_matches_twin() {
         Arc::make_mut(keyframe).stamp.0 = 10 + i64::try_from(ix).unwrap();
     }
     let keyframes: Vec<_> = with.into_iter().chain(without).collect();
-    for options in gpu_variants() {
-        let (got, twin, voxel_grid) = fused_with_twin(&options, &keyframes);
-        compare(&got, &twin, &voxel_grid);
-    }
+    let (got, twin, voxel_grid) = fused_with_twin(&keyframes);
+    compare(&got, &twin, &voxel_grid);
 }
 
 fn rays(pose: &Transform, voxel_grid: &VoxelGrid) -> Vec<Ray> {
@@ -163,34 +153,31 @@ fn pictures_without_erased_space_match_twin() {
 
 /// Compares a picture with the twin's, which must contain so many pixels with a surface.
 fn check_pictures(edits: &Arc<Edits>, min_hits: usize) {
-    for options in gpu_variants() {
-        let keyframes = scene();
-        let (blocks, voxel_grid, mut model) = fused(&options, &keyframes);
-        let pose = scenes::look_at(Point3::new(1.3, 0.4, 0.6), Point3::new(0.3, -0.2, 0.1));
-        let picture =
-            model.render(&RenderRequest { far_m: 3.0, edits: Arc::clone(edits), ..scenes::request(pose) }).unwrap();
-        let (mut n_hits, mut n_off) = (0_usize, 0_usize);
-        let mut mismatches = Mismatches::default();
-        for (ix, ray) in rays(&pose, &voxel_grid).iter().enumerate() {
-            let hit = reference::cast(&blocks, &voxel_grid, ray, edits);
-            let got = picture.depth_m[ix];
-            n_hits += usize::from(hit.is_some());
-            let rgba = &picture.rgba_srgb[4 * ix..4 * ix + 4];
-            assert_eq!(rgba[3] == 255, got > 0.0);
-            let Some(hit) =
-                hit.filter(|hit| got > 0.0 && (f64::from(got) - hit.depth_m).abs() < 0.2 * voxel_grid.voxel_m)
-            else {
-                n_off += usize::from(hit.is_some() || got > 0.0);
-                continue;
-            };
-            for (got, expected) in rgba.iter().zip(hit.color_srgb) {
-                mismatches.check(ix, f64::from(*got), 255.0 * expected, 3.0, 0.0);
-            }
+    let keyframes = scene();
+    let (blocks, voxel_grid, mut model) = fused(&keyframes);
+    let pose = scenes::look_at(Point3::new(1.3, 0.4, 0.6), Point3::new(0.3, -0.2, 0.1));
+    let picture =
+        model.render(&RenderRequest { far_m: 3.0, edits: Arc::clone(edits), ..scenes::request(pose) }).unwrap();
+    let (mut n_hits, mut n_off) = (0_usize, 0_usize);
+    let mut mismatches = Mismatches::default();
+    for (ix, ray) in rays(&pose, &voxel_grid).iter().enumerate() {
+        let hit = reference::cast(&blocks, &voxel_grid, ray, edits);
+        let got = picture.depth_m[ix];
+        n_hits += usize::from(hit.is_some());
+        let rgba = &picture.rgba_srgb[4 * ix..4 * ix + 4];
+        assert_eq!(rgba[3] == 255, got > 0.0);
+        let Some(hit) = hit.filter(|hit| got > 0.0 && (f64::from(got) - hit.depth_m).abs() < 0.2 * voxel_grid.voxel_m)
+        else {
+            n_off += usize::from(hit.is_some() || got > 0.0);
+            continue;
+        };
+        for (got, expected) in rgba.iter().zip(hit.color_srgb) {
+            mismatches.check(ix, f64::from(*got), 255.0 * expected, 3.0, 0.0);
         }
-        assert!(n_hits > min_hits, "{n_hits}");
-        assert!((n_off as f64) < 0.01 * n_hits as f64, "{n_off} of {n_hits} pixels differ");
-        mismatches.assert_none();
     }
+    assert!(n_hits > min_hits, "{n_hits}");
+    assert!((n_off as f64) < 0.01 * n_hits as f64, "{n_off} of {n_hits} pixels differ");
+    mismatches.assert_none();
 }
 
 #[test]
@@ -200,26 +187,24 @@ fn readings_match_twin() {
     use super::passes::KeyframeSlot;
     let keyframe = &scene()[0];
     let depth = keyframe.depth.as_ref().unwrap();
-    for options in gpu_variants() {
-        let gpu = Gpu::open(&options).unwrap();
-        let voxel_grid = VoxelGrid::choose(&scenes::options().specific, None, depth).unwrap();
-        let field = FieldBuffers::new(&gpu, &voxel_grid, Capacity { n_blocks: 2048, n_chunks: 256 }).unwrap();
-        assert_eq!(field.field.bytes(), size_of::<Field>() as u64);
-        let n = depth.depth_m.len();
-        let mut slot = KeyframeSlot::new(&gpu, n as u64, u64::from(keyframe.size_px[0] * keyframe.size_px[1])).unwrap();
-        slot.upload(&gpu, keyframe, &DepthView::of(keyframe, &voxel_grid).unwrap());
-        let mut list = crate::gpu::Passes::default();
-        let pipelines = Pipelines::new(&gpu).unwrap();
-        super::passes::fuse(&gpu, &mut list, &pipelines, &field, &slot);
-        list.submit(&gpu);
-        let got: Vec<[f32; 2]> = gpu.read(slot.readings(), n).unwrap();
-        let mut mismatches = Mismatches::default();
-        for (ix, (got, expected)) in got.iter().zip(reference::readings(depth, &voxel_grid)).enumerate() {
-            mismatches.check(format!("depth {ix}"), got[0].into(), expected.depth_m, 1e-9, 1e-6);
-            mismatches.check(format!("ray_dot_normal {ix}"), got[1].into(), expected.ray_dot_normal, 2e-4, 1e-4);
-        }
-        mismatches.assert_none();
+    let gpu = test_gpu();
+    let voxel_grid = VoxelGrid::choose(&scenes::options().specific, None, depth).unwrap();
+    let field = FieldBuffers::new(&gpu, &voxel_grid, Capacity { n_blocks: 2048, n_chunks: 256 }).unwrap();
+    assert_eq!(field.field.bytes(), size_of::<Field>() as u64);
+    let n = depth.depth_m.len();
+    let mut slot = KeyframeSlot::new(&gpu, n as u64, u64::from(keyframe.size_px[0] * keyframe.size_px[1])).unwrap();
+    slot.upload(&gpu, keyframe, &DepthView::of(keyframe, &voxel_grid).unwrap());
+    let mut list = crate::gpu::Passes::default();
+    let pipelines = Pipelines::new(&gpu).unwrap();
+    super::passes::fuse(&gpu, &mut list, &pipelines, &field, &slot);
+    list.submit(&gpu);
+    let got: Vec<[f32; 2]> = gpu.read(slot.readings(), n).unwrap();
+    let mut mismatches = Mismatches::default();
+    for (ix, (got, expected)) in got.iter().zip(reference::readings(depth, &voxel_grid)).enumerate() {
+        mismatches.check(format!("depth {ix}"), got[0].into(), expected.depth_m, 1e-9, 1e-6);
+        mismatches.check(format!("ray_dot_normal {ix}"), got[1].into(), expected.ray_dot_normal, 2e-4, 1e-4);
     }
+    mismatches.assert_none();
 }
 
 #[test]
@@ -235,26 +220,24 @@ fn non_finite_depth_is_ignored() {
     let mut with_holes = finite.clone();
     replace_depth(&mut with_holes[1], &|ix, z| if ix % 11 == 3 { 0.0 } else { z });
     replace_depth(&mut non_finite[1], &|ix, z| if ix % 11 == 3 { bad_values[ix % bad_values.len()] } else { z });
-    for options in gpu_variants() {
-        let expected = fused(&options, &with_holes).0;
-        assert!(fused(&options, &non_finite).0 == expected);
-        let all_non_finite: Vec<_> = non_finite
-            .iter()
-            .cloned()
-            .map(|mut keyframe| {
-                replace_depth(&mut keyframe, &|ix, _| bad_values[ix % bad_values.len()]);
-                keyframe
-            })
-            .collect();
-        let gpu = Gpu::open(&options).unwrap();
-        let mut model = TsdfModel::new(gpu, ModelOptions::default()).unwrap();
-        for keyframe in all_non_finite {
-            model.push(keyframe).unwrap();
-        }
-        fuse_all(&mut model);
-        assert!(model.blocks().unwrap().is_empty());
-        assert_eq!(model.progress().step, 3);
+    let expected = fused(&with_holes).0;
+    assert!(fused(&non_finite).0 == expected);
+    let all_non_finite: Vec<_> = non_finite
+        .iter()
+        .cloned()
+        .map(|mut keyframe| {
+            replace_depth(&mut keyframe, &|ix, _| bad_values[ix % bad_values.len()]);
+            keyframe
+        })
+        .collect();
+    let gpu = test_gpu();
+    let mut model = TsdfModel::new(gpu, ModelOptions::default()).unwrap();
+    for keyframe in all_non_finite {
+        model.push(keyframe).unwrap();
     }
+    fuse_all(&mut model);
+    assert!(model.blocks().unwrap().is_empty());
+    assert_eq!(model.progress().step, 3);
 }
 
 /// Rounding error in f32 of positions up to about 2 m, meters.
@@ -296,9 +279,9 @@ fn compare_triangles(mismatches: &mut Mismatches, block_coord: GridCoord, got: &
 fn triangles_match_twin() {
     // The second capacity processes a few blocks at a time and must grow first.
     let capacities = [MeshCapacity::default(), MeshCapacity { n_blocks: 100, n_vertices: 1, n_triangles: 1 }];
-    for (options, mesh_capacity) in gpu_variants().into_iter().zip(capacities) {
-        let (blocks, voxel_grid, _) = fused(&options, &scene());
-        let gpu = Gpu::open(&options).unwrap();
+    for mesh_capacity in capacities {
+        let (blocks, voxel_grid, _) = fused(&scene());
+        let gpu = test_gpu();
         let pipelines = Pipelines::new(&gpu).unwrap();
         let capacity = Capacity { n_blocks: 1, n_chunks: 64 };
         let field = FieldBuffers::with_blocks(&gpu, &pipelines, &voxel_grid, &blocks, capacity).unwrap();

@@ -200,7 +200,7 @@ impl TsdfModel {
         }
         self.record(0, 0)?;
         self.passes.submit(&self.gpu);
-        let counters = self.store.as_ref().ok_or(Error::DeviceLost)?.buffers.counters(&self.gpu)?;
+        let counters = self.store.as_ref().ok_or_else(no_blocks)?.buffers.counters(&self.gpu)?;
         self.apply_counters(&counters)?;
         Ok(1)
     }
@@ -311,7 +311,7 @@ impl Method for TsdfModel {
         for ix in 0..n_keyframes {
             self.record(n_in_flight + ix, ix)?;
         }
-        let field = &self.store.as_ref().ok_or(Error::DeviceLost)?.buffers;
+        let field = &self.store.as_ref().ok_or_else(no_blocks)?.buffers;
         let counters = self.passes.submit_reading(&self.gpu, &[(&field.status, 4 * status::LEN)]);
         let failed = self.finish_in_flight()?; // Waits for the previous submit while this one runs.
         if !failed {
@@ -396,7 +396,7 @@ impl Method for TsdfModel {
         }
         self.record(0, 0)?;
         let timings = self.passes.submit_timed(&self.gpu)?;
-        let counters = self.store.as_ref().ok_or(Error::DeviceLost)?.buffers.counters(&self.gpu)?;
+        let counters = self.store.as_ref().ok_or_else(no_blocks)?.buffers.counters(&self.gpu)?;
         self.apply_counters(&counters)?;
         Ok(timings)
     }
@@ -425,4 +425,9 @@ impl Method for TsdfModel {
     fn checkpoint(&mut self) -> Result<PendingCheckpoint, Error> {
         self.take_checkpoint()
     }
+}
+
+/// The error if a keyframe is fused before the blocks are allocated.
+fn no_blocks() -> Error {
+    Error::internal("a keyframe was fused before the blocks were allocated")
 }

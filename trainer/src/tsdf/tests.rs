@@ -2,7 +2,8 @@
 
 use super::{TsdfModel, TsdfOptions};
 use crate::checkpoint::Checkpoint;
-use crate::gpu::{Gpu, GpuOptions, f32_of};
+use crate::gpu::testing::test_gpu;
+use crate::gpu::{Gpu, f32_of};
 use crate::test_scenes::{self as scenes, SIZE_PX, TestShape};
 use crate::{Aabb, Error, Method, ModelKind, ModelOptions, Picture, Projection, RenderRequest};
 use keyframe::Keyframe;
@@ -13,7 +14,7 @@ use nalgebra::{Point3, Vector3};
 use std::sync::Arc;
 
 pub(super) fn gpu() -> Arc<Gpu> {
-    Gpu::open(&GpuOptions::default()).unwrap()
+    test_gpu()
 }
 
 fn model_with(options: ModelOptions<TsdfOptions>, keyframes: &[Arc<Keyframe>]) -> TsdfModel {

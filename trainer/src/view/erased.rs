@@ -65,12 +65,12 @@ mod tests {
     use super::*;
     use crate::Aabb;
     use crate::edits::Edit;
-    use crate::gpu::GpuOptions;
+    use crate::gpu::testing::test_gpu;
     use kinematics::Transform;
 
     #[test]
     fn alternating_views_with_and_without_edits_keep_their_buffers() {
-        let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+        let gpu = test_gpu();
         let mut passes = Passes::default();
         let mut erased = ErasedSpace::none(&gpu).unwrap();
         let with_boxes = |n: usize| {

@@ -3,7 +3,7 @@
 use super::codec::{MAX_SH_DEGREE, encode};
 use super::{COARSE_STRIDE, Chunker};
 use crate::eval::{PixelPair, psnr};
-use crate::gpu::{Gpu, GpuOptions};
+use crate::gpu::testing::test_gpu;
 use crate::splat::arrays::SplatArrays;
 use crate::splat::cloud::{scan_cloud, synthetic_cloud};
 use crate::splat::training_tests::{keyframes, options, request};
@@ -86,7 +86,7 @@ fn coarse_or_fine(chunk: &ModelChunk) -> &ChunkData {
 
 fn model(splats: &SplatArrays) -> SplatTrainer {
     let options = ModelOptions::from(SplatOptions { max_splats: 1_000_000, ..SplatOptions::default() });
-    SplatTrainer::from_arrays(Gpu::open(&GpuOptions::default()).unwrap(), options, splats).unwrap()
+    SplatTrainer::from_arrays(test_gpu(), options, splats).unwrap()
 }
 
 fn drawn(splats: &SplatArrays, request: &RenderRequest) -> Picture {
@@ -177,7 +177,7 @@ fn pictures_of_decoded_chunks_are_accurate() {
 
 #[test]
 fn pictures_of_a_trained_model_are_accurate() {
-    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let gpu = test_gpu();
     let mut trainer = SplatTrainer::new(gpu.clone(), options()).unwrap();
     let keyframes = keyframes(&gpu, true);
     for keyframe in &keyframes {

@@ -8,8 +8,8 @@ use crate::eval::depth_rmse_m;
 use crate::packing::Output;
 use crate::splat::buffers::SplatBuffers;
 use crate::splat::growth_search::{
-    COMPARED_STEPS, FEW_IMAGES, FoldModels, FoldPhase, GrowthLimit, GrowthSearch, HeldOutScore, MAX_WARM_UP,
-    SEARCH_START, doubling_trial, folds, n_folds, n_steps_of_first_round,
+    FEW_IMAGES, FoldModels, FoldPhase, GrowthLimit, GrowthSearch, HeldOutScore, doubling_trial, folds, n_folds,
+    n_steps_of_first_round,
 };
 use crate::splat::schedule::Schedule;
 use crate::splat::snapshot::{ObservedScene, Snapshot};
@@ -25,7 +25,7 @@ impl SplatTrainer {
     pub(super) fn update_growth_search(&mut self) {
         if self.trials.running_trial().is_none() {
             self.trials.restart_growth(self.n_images());
-            self.growth_search.postpone(self.schedule.step);
+            self.growth_search.postpone(self.schedule.step, &self.trials.steps);
             self.growth_search.set_n_images(self.n_images());
         }
     }
@@ -45,7 +45,7 @@ impl SplatTrainer {
         match &self.growth_search {
             GrowthSearch::Running(models) => self.schedule.step >= models.until,
             GrowthSearch::Waiting { not_before } => {
-                self.schedule.step >= SEARCH_START.max(*not_before)
+                self.schedule.step >= self.trials.steps.search.max(*not_before)
                     && self.views.len() >= 2
                     && !self.schedule.is_mature()
                     && self.trials.running_trial().is_none()
@@ -82,10 +82,12 @@ impl SplatTrainer {
         let step = self.schedule.step;
         match self.growth_search.running() {
             Some(models) => {
-                let (n_left, n_total) = models.n_steps(step);
+                let (n_left, n_total) = models.n_steps(step, &self.trials.steps);
                 n_left + n_total
             }
-            None if self.is_growth_search_due() => 2 * n_steps_of_first_round(step, n_folds(self.n_images())),
+            None if self.is_growth_search_due() => {
+                2 * n_steps_of_first_round(step, n_folds(self.n_images()), &self.trials.steps)
+            }
             None => 0,
         }
     }
@@ -150,7 +152,7 @@ impl SplatTrainer {
             return self.begin_fold_baseline();
         }
         models.phase = FoldPhase::WarmUp;
-        models.until = models.main.schedule.step.min(MAX_WARM_UP);
+        models.until = models.main.schedule.step.min(self.trials.steps.max_warm_up());
         let (set, params) = &models.main.cameras;
         let gpu = &self.recorder.gpu;
         let copy = gpu.storage("splat.camera_params", params.bytes())?;
@@ -172,7 +174,7 @@ impl SplatTrainer {
         let step = self.schedule.step;
         if let Some(models) = self.growth_search.running_mut() {
             models.fork = Some(fork);
-            (models.phase, models.until) = (FoldPhase::Baseline, step + COMPARED_STEPS);
+            (models.phase, models.until) = (FoldPhase::Baseline, step + self.trials.steps.comparison);
         }
         Ok(())
     }
@@ -260,7 +262,8 @@ impl SplatTrainer {
                     true => None,
                     false => {
                         let picture = self.renderer.picture(&mut self.recorder, drawn, Output::picture(true))?;
-                        let picture = picture.ok_or(Error::DeviceLost)?.into_picture()?;
+                        let picture =
+                            picture.ok_or_else(|| Error::internal("a picture was not read back"))?.into_picture()?;
                         depth_rmse_m(&picture.depth_m, &measured_m)?
                     }
                 };

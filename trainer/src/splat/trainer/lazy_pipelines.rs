@@ -22,14 +22,20 @@ pub(super) enum LazyPipelines {
 pub(super) struct Compiling(Option<JoinHandle<Result<TrainPipelines, Error>>>);
 
 impl Compiling {
-    fn finish(&mut self) -> Result<TrainPipelines, Error> {
-        self.0.take().and_then(|thread| thread.join().ok()).unwrap_or(Err(Error::DeviceLost))
+    fn finish(&mut self, gpu: &Gpu) -> Result<TrainPipelines, Error> {
+        let finished = self.0.take().map(JoinHandle::join);
+        let Some(Ok(compiled)) = finished else {
+            return Err(gpu.failure_or("the thread that compiles the pipelines panicked"));
+        };
+        compiled
     }
 }
 
 impl Drop for Compiling {
     fn drop(&mut self) {
-        let _ = self.finish();
+        if let Some(thread) = self.0.take() {
+            let _ = thread.join();
+        }
     }
 }
 
@@ -46,9 +52,11 @@ impl LazyPipelines {
             return Ok(ready.clone());
         }
         let ready = Arc::new(match std::mem::replace(self, Self::Failed) {
-            Self::Compiling(mut thread) => thread.finish()?,
+            Self::Compiling(mut thread) => thread.finish(gpu)?,
             Self::OnDemand => TrainPipelines::new(gpu)?,
-            Self::Ready(_) | Self::Failed => return Err(Error::DeviceLost),
+            Self::Ready(_) | Self::Failed => {
+                return Err(gpu.failure_or("a step was requested although its pipelines could not be compiled"));
+            }
         });
         *self = Self::Ready(ready.clone());
         Ok(ready)

@@ -121,7 +121,8 @@ mod tests {
     use super::*;
     use crate::Method;
     use crate::eval::{PixelPair, psnr};
-    use crate::gpu::{Gpu, GpuOptions};
+    use crate::gpu::Gpu;
+    use crate::gpu::testing::test_gpu;
     use crate::splat::training_tests::{n_keyframes, noisy, options, request, test_psnr, train};
     use crate::splat::trials::CountPolicy;
     use calibration::Candidate;
@@ -144,7 +145,7 @@ mod tests {
     }
 
     fn some_trained(n_steps: u64) -> (SplatTrainer, Vec<Arc<Keyframe>>) {
-        let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+        let gpu = test_gpu();
         let keyframes = n_keyframes(&gpu, 12, true);
         (trained(CountPolicy::Tested, &keyframes, gpu, n_steps), keyframes)
     }
@@ -209,7 +210,7 @@ mod tests {
     /// Noise hides the details, so a few splats with view-independent colors suffice.
     #[test]
     fn model_size_fits_the_scene_and_is_reproducible() {
-        let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+        let gpu = test_gpu();
         let clean = n_keyframes(&gpu, 36, false); // Without depth, training starts at the maximum number of splats.
         let keyframes = noisy(&clean);
         let mut tested = trained(CountPolicy::Tested, &keyframes, gpu.clone(), 1750);

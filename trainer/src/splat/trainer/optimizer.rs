@@ -100,7 +100,7 @@ impl Optimizer {
 
     /// Buffers of the picture of the latest step.
     pub(super) fn image_buffers(&self) -> Result<&ImageBuffers, Error> {
-        self.image_buffers.as_ref().ok_or(Error::DeviceLost)
+        self.image_buffers.as_ref().ok_or_else(|| Error::internal("no image buffers are reserved for a step"))
     }
 
     /// Allocates the buffers for training up to `capacity` splats on images of this size.
@@ -160,7 +160,10 @@ impl Optimizer {
             gpu,
             splats: &model.splats,
             scratch: renderer.scratch()?,
-            image_buffers: self.image_buffers.as_ref().ok_or(Error::DeviceLost)?,
+            image_buffers: self
+                .image_buffers
+                .as_ref()
+                .ok_or_else(|| Error::internal("no image buffers are reserved for a step"))?,
             status: &self.status,
             view: if lens.is_some() { &model.cameras.corrected } else { &level.view },
             size_px: level.size_px,

@@ -190,7 +190,7 @@ fn move_splats(gpu: &Gpu, splats: &SplatBuffers, motions: &[Motion]) -> Result<(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::gpu::GpuOptions;
+    use crate::gpu::testing::test_gpu;
     use crate::model_options::ModelOptions;
     use crate::splat::SplatOptions;
     use calibration::scenes::{Miscalibration, capture, wrong_extrinsics};
@@ -217,7 +217,7 @@ mod tests {
 
     #[test]
     fn splats_move_to_the_surfaces_of_the_corrected_keyframes() {
-        let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+        let gpu = test_gpu();
         let miscalibration = Miscalibration { extrinsics: wrong_extrinsics(), ..Miscalibration::none() };
         let [wrong, right] = [miscalibration, Miscalibration::none()].map(|miscalibration| {
             let mut keyframes = capture(&miscalibration);

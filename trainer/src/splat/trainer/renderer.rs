@@ -161,7 +161,7 @@ impl Renderer {
                 return Ok(taken);
             }
             if !self.grow_scratch(recorder, &counters, false)? {
-                return Err(Error::DeviceLost);
+                return Err(Error::internal("a view failed although all of its buffers are large enough"));
             }
             clear_failure(&recorder.gpu, &self.status);
         }
@@ -182,9 +182,12 @@ impl Renderer {
         reserve_image(recorder, &mut self.image_buffers, size_px, false)?;
         let erased = self.erased.set(&recorder.gpu, &mut recorder.passes, &camera.edits, Matrix4::identity())?;
         let erased = (!camera.edits.is_empty()).then_some(erased);
-        let (status, view, image_buffers) =
-            (&self.status, &self.view, self.image_buffers.as_ref().ok_or(Error::DeviceLost)?);
-        let scratch = self.scratch.as_ref().map(|(_, scratch)| scratch).ok_or(Error::DeviceLost)?;
+        let (status, view, image_buffers) = (
+            &self.status,
+            &self.view,
+            self.image_buffers.as_ref().ok_or_else(|| Error::internal("no image buffers are reserved for a view"))?,
+        );
+        let scratch = self.scratch.as_ref().map(|(_, scratch)| scratch).ok_or_else(no_scratch)?;
         let Recorder { gpu, passes: list } = recorder;
         write_n_splats(gpu, status, splats.n_splats);
         let passes = ViewPasses { gpu, splats, scratch, image_buffers, status, view, size_px, erased };
@@ -206,7 +209,7 @@ impl Renderer {
 
     /// The scratch buffers, which must be reserved first.
     pub(super) fn scratch(&self) -> Result<&Scratch, Error> {
-        self.scratch.as_ref().map(|(_, scratch)| scratch).ok_or(Error::DeviceLost)
+        self.scratch.as_ref().map(|(_, scratch)| scratch).ok_or_else(no_scratch)
     }
 
     /// Reserves buffers to draw a view of this size with up to `capacity` splats, and to train on it if `learned`.
@@ -323,4 +326,9 @@ pub(super) fn write_n_splats(gpu: &Gpu, status: &Buffer, n_splats: u32) {
 /// Clears the failure flag and the requested buffer sizes.
 pub(super) fn clear_failure(gpu: &Gpu, status: &Buffer) {
     gpu.write(status, 4 * status::FAILED as u64, &[0; 12]);
+}
+
+/// The error if a view is drawn before its buffers are reserved.
+fn no_scratch() -> Error {
+    Error::internal("a view was drawn before its scratch buffers were reserved")
 }

@@ -5,7 +5,7 @@ use super::renderer::DrawnView;
 use super::view_set::VIEWS_AT_ONCE;
 use super::{SplatTrainer, displayed};
 use crate::splat::params::Camera;
-use crate::splat::trials::{Scores, TRIAL_START};
+use crate::splat::trials::Scores;
 use crate::splat::views::{Level, camera_of};
 use crate::{Error, Method};
 use calibration::{CalibratedCamera, CameraCorrection, ParamSet, interpolate};
@@ -106,7 +106,7 @@ impl SplatTrainer {
     pub(super) fn add_live_arrival(&mut self, keyframe: Arc<Keyframe>) -> Result<(), Error> {
         let is_watched = self.trials.watches_gains();
         let is_compared = is_watched || self.model.cameras.set.contains(ParamSet::IMAGE_GAINS);
-        if !is_compared || self.schedule.step < TRIAL_START || self.trials.running_trial().is_some() {
+        if !is_compared || self.schedule.step < self.trials.steps.first_trial || self.trials.running_trial().is_some() {
             return self.add_arrival(keyframe);
         }
         let (learn, background_srgb) = (self.learn()?, self.background_srgb());
@@ -214,7 +214,8 @@ mod tests {
     use super::*;
     use crate::Method;
     use crate::eval::{PixelPair, psnr};
-    use crate::gpu::{Gpu, GpuOptions};
+    use crate::gpu::Gpu;
+    use crate::gpu::testing::test_gpu;
     use crate::splat::training_tests::{n_keyframes, options, request, train};
     use calibration::{CameraRefinement, ParamSet};
     use keyframe::Split;
@@ -236,7 +237,7 @@ mod tests {
 
     #[test]
     fn scores_match_rendered_pictures() {
-        let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+        let gpu = test_gpu();
         let keyframes = n_keyframes(&gpu, 12, true);
         let mut trainer = trained(&keyframes, gpu, 60);
         let validation: Vec<_> = keyframes.iter().filter(|keyframe| keyframe.split == Split::Validation).collect();
@@ -255,7 +256,7 @@ mod tests {
 
     #[test]
     fn gpu_scores_match_rendered_pictures_bit_for_bit() {
-        let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+        let gpu = test_gpu();
         let keyframes = n_keyframes(&gpu, 5, true);
         let request_for = |keyframe: &Keyframe| request(keyframe.world_from_camera);
         let mut trainer = SplatTrainer::new(gpu, options()).unwrap();
@@ -302,7 +303,7 @@ mod tests {
 
     #[test]
     fn gains_are_learned_only_if_exposure_changes() {
-        let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+        let gpu = test_gpu();
         let even = n_keyframes(&gpu, 36, true);
         let trainer = trained(&even, gpu.clone(), 510);
         assert!(trainer.trials().len() == 1 && !trainer.trials()[0].kept, "{:?}", trainer.trials());
@@ -317,17 +318,19 @@ mod tests {
 
     #[test]
     fn gains_are_learned_once_arriving_keyframes_show_a_change_of_exposure() {
-        let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+        const FIRST_TRIAL: u64 = 250;
+        let gpu = test_gpu();
         let even = n_keyframes(&gpu, 36, true);
         let watching = options().with(|options| {
             options.common.cameras = CameraRefinement::AlwaysAndWatch(ParamSet::empty(), GAINS);
             options.common.n_planned_steps = 1000;
+            options.specific.trial_steps.first_trial = FIRST_TRIAL;
         });
         let trained_live = |keyframes: &[Arc<Keyframe>]| {
             let mut trainer = SplatTrainer::new(gpu.clone(), watching.clone()).unwrap();
             let (first, later) = keyframes.split_at(keyframes.len() / 2 - 3);
             first.iter().for_each(|keyframe| trainer.push(keyframe.clone()).unwrap());
-            train(&mut trainer, TRIAL_START);
+            train(&mut trainer, FIRST_TRIAL);
             for keyframe in later {
                 trainer.push(keyframe.clone()).unwrap();
                 train(&mut trainer, 5);

@@ -121,7 +121,7 @@ impl SplatTrainer {
             .min(by_time.clamp(1, MAX_STEPS_PER_SUBMIT))
             .min(self.schedule.steps_to_next_change())
             .min(self.trials.steps_left(self.schedule.step))
-            .min(self.growth_search.steps_left(self.schedule.step))
+            .min(self.growth_search.steps_left(self.schedule.step, &self.trials.steps))
     }
 
     /// Uploads the settings of the next steps.
@@ -235,7 +235,8 @@ pub(super) fn growth_key(seed: u64, step: u64) -> u32 {
 mod tests {
     use super::*;
     use crate::Method;
-    use crate::gpu::{Gpu, GpuOptions};
+    use crate::gpu::GpuOptions;
+    use crate::gpu::testing::test_gpu_with;
     use crate::splat::training_tests::{n_keyframes, options, request, train};
     use keyframe::{Keyframe, Split};
     use std::sync::Arc;
@@ -245,8 +246,7 @@ mod tests {
     /// A trainer whose GPU has too little memory for 2000 splats that cover the whole image, and its keyframes.
     fn with_little_memory() -> (SplatTrainer, Vec<Arc<Keyframe>>) {
         const MAX_BINDING_BYTES: u64 = 1_600_000; // Slightly more than the initial buffers.
-        let gpu =
-            Gpu::open(&GpuOptions { max_binding_bytes: Some(MAX_BINDING_BYTES), ..GpuOptions::default() }).unwrap();
+        let gpu = test_gpu_with(&GpuOptions { max_binding_bytes: Some(MAX_BINDING_BYTES), ..GpuOptions::default() });
         let keyframes = n_keyframes(&gpu, 10, true);
         let mut trainer =
             SplatTrainer::new(gpu, options().with(|options| options.specific.coarse_steps = Some([0, 0]))).unwrap();

@@ -1,7 +1,7 @@
 //! Chunks of meshes, decoded as `docs/reference/protocol.md` says.
 
 use crate::edits::{Edit, Edits};
-use crate::gpu::{Gpu, GpuOptions};
+use crate::gpu::testing::test_gpu;
 use crate::test_scenes as scenes;
 use crate::tsdf::TsdfModel;
 use crate::tsdf::mesh::Mesh;
@@ -109,7 +109,7 @@ impl Replica {
 fn chunks_follow_the_mesh() {
     let at = Point3::new(0.1, 0.0, 0.2);
     let keyframes = scenes::ring(&[scenes::ball(at), scenes::floor()], at, 4);
-    let mut model = TsdfModel::new(Gpu::open(&GpuOptions::default()).unwrap(), scenes::options()).unwrap();
+    let mut model = TsdfModel::new(test_gpu(), scenes::options()).unwrap();
     assert!(model.queue_chunks(false, &Arc::default()).unwrap().is_none(), "an empty model");
     let mut replica = Replica::default();
     for keyframe in &keyframes {
@@ -137,7 +137,7 @@ fn removed_surfaces_remove_chunks() {
     let at = Point3::new(0.1, 0.0, 0.2);
     let with = scenes::ring(&[scenes::ball(at), scenes::floor()], at, 2);
     let without = scenes::ring(&[scenes::floor()], at, 8);
-    let mut model = TsdfModel::new(Gpu::open(&GpuOptions::default()).unwrap(), scenes::options()).unwrap();
+    let mut model = TsdfModel::new(test_gpu(), scenes::options()).unwrap();
     let mut replica = Replica::default();
     let mut n_removed = 0;
     for keyframe in with.iter().chain(std::iter::repeat_n(&without, 4).flatten()) {
@@ -155,7 +155,7 @@ fn removed_surfaces_remove_chunks() {
 #[test]
 fn chunks_lack_erased_triangles() {
     let at = Point3::new(0.1, 0.0, 0.2);
-    let mut model = TsdfModel::new(Gpu::open(&GpuOptions::default()).unwrap(), scenes::options()).unwrap();
+    let mut model = TsdfModel::new(test_gpu(), scenes::options()).unwrap();
     for keyframe in scenes::ring(&[scenes::ball(at), scenes::floor()], at, 4) {
         model.push(keyframe).unwrap();
     }

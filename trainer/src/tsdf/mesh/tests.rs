@@ -2,7 +2,7 @@
 
 use super::{Mesh, write_glb, write_ply};
 use crate::Method;
-use crate::gpu::{Gpu, GpuOptions};
+use crate::gpu::testing::test_gpu;
 use crate::model_options::ModelOptions;
 use crate::test_scenes::{self as scenes, TestShape};
 use crate::tsdf::tests::fuse_all;
@@ -13,7 +13,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 fn model(options: ModelOptions<TsdfOptions>, keyframes: &[Arc<Keyframe>]) -> TsdfModel {
-    let mut model = TsdfModel::new(Gpu::open(&GpuOptions::default()).unwrap(), options).unwrap();
+    let mut model = TsdfModel::new(test_gpu(), options).unwrap();
     for keyframe in keyframes {
         model.push(keyframe.clone()).unwrap();
     }
@@ -98,7 +98,7 @@ fn incremental_mesh_equals_full_mesh() {
     let at = Point3::new(0.1, 0.0, 0.2);
     let keyframes = scenes::ring(&[scenes::ball(at), scenes::floor()], at, 4);
     let whole = model(scenes::options(), &keyframes).mesh().unwrap();
-    let mut incremental = TsdfModel::new(Gpu::open(&GpuOptions::default()).unwrap(), scenes::options()).unwrap();
+    let mut incremental = TsdfModel::new(test_gpu(), scenes::options()).unwrap();
     for keyframe in &keyframes {
         incremental.push(keyframe.clone()).unwrap();
         while incremental.step(1).unwrap() > 0 {}

@@ -19,7 +19,7 @@ impl TsdfModel {
         if !self.record_picture(camera, background_srgb)? {
             return Ok(Rendered::empty(camera.size_px, background_srgb, output));
         }
-        let canvas = self.canvas.as_ref().ok_or(Error::DeviceLost)?;
+        let canvas = self.canvas.as_ref().ok_or_else(|| Error::internal("the canvas of a picture is missing"))?;
         let canvas = [&canvas.pixels, &canvas.depths];
         self.reader.read(&self.gpu, &mut self.passes, output, camera.size_px, canvas)
     }
