@@ -4,7 +4,8 @@
 # them. Without root, they print the command that installs the system packages.
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test hil check fuzz deps web cargo packages test-packages check-packages mujoco realsense open-ends
+.PHONY: help demo test quick test-gpu hil check fuzz deps web cargo packages test-packages check-packages mujoco realsense open-ends \
+	begin-test lint doc kernels manifests licenses
 # Cargo and npm already use all processors, and two runs of apt would block each other.
 .NOTPARALLEL:
 
@@ -15,32 +16,61 @@ FEATURES := --features sim
 TEST_FEATURES = $(FEATURES),nokhwa,foxglove$(shell [ -e .deps/realsense/made-of ] && \
 	scripts/install-packages.sh --check realsense 2>/dev/null && echo ,realsense)
 
+# The crates whose code depends on features.
+CONDITIONAL := --package fieldrig --package capture --package drivers --package trainer --package viz
+
+# Folder of everything that cargo builds.
+TARGET_FOLDER := $(or $(CARGO_TARGET_DIR),target)
+# Runs a step and records how long it takes.
+STEPS := $(TARGET_FOLDER)/steps.tsv
+STEP := scripts/timed.sh $(STEPS)
+
 # Rig that `make demo` simulates: name of a file in the folder rigs, without extension.
 RIG ?= static-arm
 # Duration of `make hil` in seconds.
 LISTEN_SECONDS ?= 20
 
 help: ## List the targets
-	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-9s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
 demo: deps web ## Simulate a rig (RIG=static-arm, mobile-arm, mobile-base-small, ...) and serve the live scene; needs no display
 	cargo build --release $(FEATURES)
-	target/release/fieldrig run rigs/$(RIG).toml --sim
+	$(TARGET_FOLDER)/release/fieldrig run rigs/$(RIG).toml --sim
 
-test: test-packages check web ## Run lints, documentation and all tests that need no device
-	cargo test --workspace $(TEST_FEATURES) --no-fail-fast
+test: begin-test test-packages lint doc manifests licenses web ## Run lints, documentation and all tests that need no device
+	@scripts/run-tests.py --steps $(STEPS) --report $(TARGET_FOLDER)/test-times.md -- --workspace $(TEST_FEATURES)
+
+quick: begin-test lint ## Run lints and the tests that need neither a GPU nor a browser
+	@scripts/run-tests.py --steps $(STEPS) --no-doc --quick -- --workspace --lib --bins $(TEST_FEATURES)
+
+test-gpu: deps ## Run the tests that need a real GPU
+	FIELDRIG_GPU_TESTS=demand scripts/run-tests.py --no-doc --only "^trainer unit" --filter needs_ -- --package trainer --lib
+
+# Forgets the durations of earlier steps.
+begin-test:
+	@rm -f $(STEPS)
 
 hil: cargo packages web ## Check the devices of the rig RIG=file.toml: reads all of them for LISTEN_SECONDS=20 and moves nothing
 	cargo build --release $(shell pkg-config --exists realsense2 2>/dev/null && echo --features realsense)
-	target/release/fieldrig doctor $(if $(filter file,$(origin RIG)),$(error RIG is not set; run: make hil RIG=file.toml),$(RIG)) --listen $(LISTEN_SECONDS)
+	$(TARGET_FOLDER)/release/fieldrig doctor $(if $(filter file,$(origin RIG)),$(error RIG is not set; run: make hil RIG=file.toml),$(RIG)) --listen $(LISTEN_SECONDS)
 
-check: check-packages deps realsense open-ends ## Check format, clippy, documentation, kernels, licenses, to-do markers
-	cargo fmt --all --check
-	cargo clippy --workspace --all-targets $(TEST_FEATURES) -- -D warnings
-	cargo clippy --workspace --exclude sim --all-targets --no-default-features -- -D warnings
-	RUSTDOCFLAGS="-D warnings" cargo doc --workspace --no-deps $(TEST_FEATURES)
+check: lint doc kernels manifests licenses ## Check format, clippy, documentation, kernels, licenses, to-do markers
+
+lint: check-packages deps realsense open-ends
+	@$(STEP) format cargo fmt --all --check
+	@$(STEP) clippy cargo clippy --workspace --all-targets $(TEST_FEATURES) -- -D warnings
+	@$(STEP) "clippy without features" cargo clippy $(CONDITIONAL) --all-targets --no-default-features --no-deps -- -D warnings
+
+doc: lint
+	@RUSTDOCFLAGS="-D warnings" $(STEP) documentation cargo doc --workspace --no-deps $(TEST_FEATURES)
+
+kernels: deps realsense
 	cargo test --workspace $(TEST_FEATURES) --lib every_kernel_is_valid
+
+manifests: cargo
 	@cargo metadata --locked --manifest-path fuzz/Cargo.toml --format-version 1 >/dev/null || { echo "fuzz/Cargo.lock does not match fuzz/Cargo.toml; to update it, run: cargo metadata --manifest-path fuzz/Cargo.toml" >&2; exit 1; }
+
+licenses: cargo
 	@if cargo deny --version >/dev/null 2>&1; then \
 		cargo deny check licenses bans sources || exit 1; \
 		if cargo deny fetch db >/dev/null 2>&1; then cargo deny check advisories; \
@@ -55,7 +85,7 @@ fuzz: cargo ## Fuzz all parsers, SECONDS=600 each, or only TARGET=can (scripts/f
 deps: cargo packages mujoco ## Install build and test dependencies
 
 web: cargo packages ## Build the web page that the binary embeds
-	scripts/build-web.sh
+	@$(STEP) "web page" scripts/build-web.sh
 
 cargo:
 	@scripts/check-cargo.sh
@@ -67,7 +97,7 @@ packages:
 # with a message, unless FIELDRIG_HIL=demand.
 OPTIONAL = $(if $(filter demand,$(FIELDRIG_HIL)),,--optional)
 test-packages: cargo
-	@scripts/install-packages.sh build gpu sim web nokhwa $(OPTIONAL) realsense hil
+	@$(STEP) packages scripts/install-packages.sh build gpu sim web nokhwa $(OPTIONAL) realsense browser hil
 
 check-packages: cargo
 	@scripts/install-packages.sh build gpu sim web nokhwa $(OPTIONAL) realsense

@@ -6,7 +6,7 @@
 # Each check looks for the file or command that a build or program uses (a header, a library for this processor, a command that runs), not
 # for a package name. This detects incomplete packages and accepts software from other sources.
 #
-# usage: install-packages.sh [--check] GROUP... [--optional GROUP...]      groups: build gpu sim web nokhwa realsense hil
+# usage: install-packages.sh [--check] GROUP... [--optional GROUP...]      groups: build gpu sim web nokhwa realsense browser hil
 #   --check       print what is missing and fail; install nothing
 #   --optional    the groups after it are optional: if their packages cannot be installed, print a message and succeed
 set -eu
@@ -80,16 +80,6 @@ links() {
     printf '%b' "$source" | cc -x c - -o "$object" "$@" >/dev/null 2>&1 || status=1
     rm -f "$object"
     return $status
-}
-
-# need_header HEADER LIBRARY PACKAGE REASON: adds the package unless programs can be linked with the library. Without the -dev package, the
-# header and the file name that the linker looks for are missing.
-need_header() {
-    if links 'int main(void) { return 0; }\n'; then
-        links "#include <$1>\nint main(void) { return 0; }\n" "-l$2" || need "$3" "$4"
-    else
-        need_package "$3" "$4"
-    fi
 }
 
 # has_lavapipe: whether the Vulkan loader finds Mesa's software driver, for this processor.
@@ -218,31 +208,33 @@ check() {
         need_command nm binutils "lists the Python functions that the pinned librealsense2 imports"
         need_pip "downloads the RealSense wheel"
         ;;
+    browser)
+        command -v chromium >/dev/null 2>&1 || command -v google-chrome >/dev/null 2>&1 ||
+            need_command chromium-browser chromium "opens the page in the tests"
+        ;;
     hil)
         if ! hil_is_supported; then
             return 0
         fi
-        need_file /usr/src/linux-source-6.1.tar.xz linux-source-6.1 "source of the kernels that emulate cameras and CAN buses for the tests"
-        need_command make make "builds these kernels"
-        need_command flex flex "builds these kernels"
-        need_command bison bison "builds these kernels"
-        need_command bc bc "builds these kernels"
+        need_file /usr/src/linux-source-6.1.tar.xz linux-source-6.1 "source of the kernel that emulates cameras and CAN buses for the tests"
+        need_command make make "builds this kernel"
+        need_command flex flex "builds this kernel"
+        need_command bison bison "builds this kernel"
+        need_command bc bc "builds this kernel"
         need_command xz xz-utils "unpacks their source"
-        need_header libelf.h elf libelf-dev "builds these kernels"
-        need_header openssl/opensslv.h crypto libssl-dev "builds these kernels"
-        need_package busybox-static "starts the tests in these kernels"
+        need_package busybox-static "starts the tests in the virtual machines"
         need_file /usr/bin/qemu-system-x86_64 qemu-system-x86 "emulates CAN cards for the tests"
         need_file /usr/sbin/ip iproute2 "sets up the CAN cards"
         python_has 'import ensurepip, venv' || need python3-venv "runs the Franka simulator and libfranka for the tests"
         ;;
     *)
-        echo "install-packages: unknown group $1 (build, gpu, sim, web, nokhwa, realsense, hil)" >&2
+        echo "install-packages: unknown group $1 (build, gpu, sim, web, nokhwa, realsense, browser, hil)" >&2
         exit 2
         ;;
     esac
 }
 
-# The virtual kernels of tests/hil are built from Debian 12's kernel source.
+# The virtual machines of tests/hil use the kernel of Debian 12 and its source.
 hil_is_supported() {
     grep -q '^VERSION_CODENAME=bookworm$' /etc/os-release 2>/dev/null && [ "$(uname -m)" = x86_64 ]
 }

@@ -160,7 +160,7 @@ state() {
         inside "$environment scripts/install-packages.sh $groups" 2>&1 | grep -v '^skipping the tests in virtual kernels' >"$folder/out" || true
         [ ! -s "$folder/out" ] || fail "a second run prints: $(cat "$folder/out")"
         for group in $groups; do
-            case $group in build | gpu | sim | web | nokhwa | realsense | hil) "use_$group" ;; esac
+            case $group in build | gpu | sim | web | nokhwa | realsense | browser | hil) "use_$group" ;; esac
         done
     fi
     finish
@@ -310,6 +310,11 @@ use_realsense() {
         >>"$log" 2>&1 || fail "a program with librealsense2 does not run, see $log"
 }
 
+use_browser() {
+    inside 'chromium --headless --no-sandbox --disable-gpu --dump-dom "data:text/html,<p>it works</p>"' 2>>"$log" | grep -q 'it works' ||
+        fail "Chromium does not open a page, see $log"
+}
+
 use_hil() {
     [ "$suite" = bookworm ] || return 0
     inside 'tar --list --file /usr/src/linux-source-6.1.tar.xz | head -n 1 && python3 -m venv /tmp/venv && /tmp/venv/bin/pip --version &&
@@ -327,11 +332,11 @@ for suite in ${suites:-bookworm trixie}; do
     case $suite in
     bookworm)
         llvm=14
-        hil="bc bison busybox-static flex iproute2 libelf-dev libssl-dev linux-source-6.1 make python3-venv qemu-system-x86 xz-utils"
-        runtime="libelf1 libssl3 libudev1 libusb-1.0-0"
+        hil="bc bison busybox-static flex iproute2 linux-source-6.1 make python3-venv qemu-system-x86 xz-utils"
+        runtime="libudev1 libusb-1.0-0"
         ;;
     trixie)
-        llvm=19 hil="" runtime="libelf1t64 libssl3t64 libudev1 libusb-1.0-0"
+        llvm=19 hil="" runtime="libudev1 libusb-1.0-0"
         ;;
     esac
     sorted() {
@@ -339,8 +344,8 @@ for suite in ${suites:-bookworm trixie}; do
     }
     gpu="libvulkan1 mesa-vulkan-drivers" sim="libegl-mesa0 libegl1 libgl1-mesa-dri python3-pip"
 
-    state bare "build gpu sim web nokhwa realsense hil" \
-        "$(sorted "$build" "$gpu" "$sim" nodejs npm libclang-dev binutils libusb-1.0-0 patchelf "$hil")" </dev/null
+    state bare "build gpu sim web nokhwa realsense browser hil" \
+        "$(sorted "$build" "$gpu" "$sim" nodejs npm libclang-dev binutils libusb-1.0-0 patchelf chromium "$hil")" </dev/null
 
     cargo_state
 

@@ -1,0 +1,339 @@
+#!/usr/bin/env python3
+"""Builds all test programs with cargo, runs them, and reports how long each step, program and test took.
+
+usage: run-tests.py [--steps FILE] [--report FILE] [--only REGEX] [--filter TEXT] [--no-doc] [--quick] -- CARGO_ARGUMENT...
+
+    --steps FILE    durations of earlier steps (scripts/timed.sh), reported at the end
+    --report FILE   also writes the report to this file, as Markdown
+    --only REGEX    runs only the test programs whose name matches, such as `trainer unit` or `viz page`
+    --filter TEXT   runs only the tests whose name contains this text
+    --no-doc        skips the examples in documentation
+    --quick         runs only unit tests, and none that need a GPU
+
+The arguments after `--` are passed to `cargo test`, for example `--workspace --features sim`. Tests that this machine
+cannot run report why (tests/support/src/skip.rs); they are counted as skipped and listed at the end.
+"""
+
+import argparse
+import collections
+import json
+import os
+import pathlib
+import re
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+
+# Programs that use a single processor and are sensitive to timing. They run on the last processor, beside all other
+# programs, which then use the remaining processors.
+BESIDE = ("fieldrig hil",)
+# Tests that need other settings than the rest of their program: program, part of the names of the tests, environment. Mesa's
+# software Vulkan has subgroups of 16 lanes with this width, so that the kernels for GPUs run, too.
+SEPARATE = (("trainer unit", "needs_large_subgroups", {"LP_NATIVE_VECTOR_WIDTH": "512"}),)
+# Programs that start first, because they take longest. The others follow in the order of their names.
+FIRST = ("trainer unit",)
+# With --quick: only programs with unit tests, without these modules, whose tests need a GPU. No GPU is visible to the programs,
+# so a test that needs one fails unless its module is listed here.
+WITHOUT_GPU = {"VK_DRIVER_FILES": "/dev/null", "VK_ICD_FILENAMES": "/dev/null"}
+NOT_QUICK = {
+    "trainer unit": (
+        "against_twin", "aligned::", "alignment_tests", "checkpoint_tests", "doubling_tests", "edit_tests", "gpu::",
+        "growth_search_tests", "mean_color::", "needs_", "nerf::bench", "nerf::tests", "non_finite_tests", "packing::tests",
+        "registry::tests", "sort::tests", "splat::chunks", "splat::entry", "splat::trainer", "training_tests", "trial_tests",
+        "tsdf::mesh", "tsdf::tests", "view::erased",
+    ),
+    "session unit": ("session::tests", "recoveries::tests"),
+}
+N_SLOWEST = 10
+
+TEST_LINE = re.compile(r"test (.+?)(?: - should panic| - compile| - compile fail)? \.\.\. (ok|FAILED|ignored)\b(?:.*<([0-9.]+)s>)?")
+
+
+class Program:
+    """A test program. The results are empty until it has run."""
+
+    def __init__(self, name, command, folder, environment=()):
+        self.name, self.command, self.folder = name, command, folder
+        self.environment = dict(environment)
+        self.secs = 0.0
+        self.process = None
+        self.output_path = None
+        self.status = None
+        self.output = ""
+        # (name, result, seconds)
+        self.tests = []
+        # Reasons by test.
+        self.skipped = {}
+
+    def count(self, result):
+        return sum(found == result for _, found, _ in self.tests)
+
+    def counts(self):
+        """Numbers of passed, failed and skipped tests."""
+        return self.count("ok") - len(self.skipped), self.count("FAILED"), len(self.skipped)
+
+    def has_failed(self):
+        return self.status != 0
+
+    def run(self, processors):
+        """Runs the program on some processors."""
+        since = time.monotonic()
+        # The option for times is unstable; RUSTC_BOOTSTRAP allows it, here only for programs that are already built. Mesa's
+        # software Vulkan runs kernels on the calling thread, which takes a third less computing time than handing parts of
+        # them to other threads: tests run in parallel anyway.
+        environment = dict(os.environ, RUSTC_BOOTSTRAP="1", LP_NUM_THREADS="0", **self.environment)
+        # With a single thread, the harness prints a line in two parts, and the output of the test comes between them.
+        environment["RUST_TEST_THREADS"] = str(max(2, os.cpu_count()))
+        with tempfile.TemporaryDirectory() as folder, open(pathlib.Path(folder, "output"), "w+b") as output:
+            self.output_path = pathlib.Path(folder, "output")
+            skipped = pathlib.Path(folder, "skipped")
+            environment["FIELDRIG_SKIPPED_TESTS"] = str(skipped)
+            # A process group of its own, so that `set_processors` finds the programs that it starts.
+            self.process = subprocess.Popen(
+                self.command,
+                cwd=self.folder,
+                env=environment,
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                preexec_fn=lambda: (os.setpgrp(), os.sched_setaffinity(0, processors)),
+            )
+            self.status = self.process.wait()
+            output.seek(0)
+            self.output = output.read().decode(errors="replace")
+            if skipped.exists():
+                lines = skipped.read_text(errors="replace").splitlines()
+                self.skipped = dict(line.split("\t", 1) for line in lines)
+        self.secs = time.monotonic() - since
+        self.tests = tests_in(self.output)
+
+    def is_running(self):
+        return self.process is not None and self.process.poll() is None
+
+    def n_finished(self):
+        """Number of tests that have finished so far."""
+        try:
+            return len([result for _, result, _ in tests_in(self.output_path.read_text(errors="replace")) if result != "ignored"])
+        except OSError:
+            return 0  # The program has just ended.
+
+
+    def set_processors(self, processors):
+        """Moves the running program, and all programs that it has started, to other processors."""
+        if not self.is_running():
+            return
+        for task in pathlib.Path("/proc").glob("[0-9]*/task/*"):
+            try:
+                fields = pathlib.Path(task, "stat").read_text().rpartition(")")[2].split()
+                if int(fields[2]) == self.process.pid:
+                    os.sched_setaffinity(int(task.name), processors)
+            except OSError:
+                pass  # The task has ended meanwhile.
+
+    def stop(self):
+        """Ends the program and all programs that it has started."""
+        if self.is_running():
+            os.killpg(self.process.pid, signal.SIGTERM)
+
+
+def tests_in(output):
+    """Name, result and seconds of each test in the output of a program."""
+    found = filter(None, map(TEST_LINE.match, output.splitlines()))
+    return [(line[1], line[2], float(line[3] or 0)) for line in found]
+
+
+def build(cargo_arguments):
+    """Builds all test programs, and returns them."""
+    command = ["cargo", "test", "--no-run", "--message-format", "json-render-diagnostics", *cargo_arguments]
+    print("+", " ".join(command), flush=True)
+    programs = []
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as cargo:
+        for line in cargo.stdout:
+            message = json.loads(line) if line.startswith("{") else {}
+            if message.get("reason") != "compiler-artifact" or not message["profile"]["test"] or not message["executable"]:
+                continue
+            folder = pathlib.Path(message["manifest_path"]).parent
+            target = message["target"]
+            is_unit = target["kind"] != ["test"]
+            name = f"{package_name(message['package_id'])} {'unit' if is_unit else target['name']}"
+            if is_unit and target["kind"] == ["bin"]:
+                name += " (program)"
+            arguments = ["-Z", "unstable-options", "--report-time"]
+            programs.append(Program(name, [message["executable"], *arguments], folder))
+    if cargo.returncode != 0:
+        sys.exit(cargo.returncode)
+    return sorted(programs, key=lambda program: (program.name not in FIRST, program.name))
+
+
+def separated(programs):
+    """The programs, with the tests of SEPARATE in programs of their own."""
+    extra = []
+    for program in programs:
+        for name, tests, environment in SEPARATE:
+            if program.name == name:
+                extra.append(Program(f"{name} {tests}", [*program.command, tests], program.folder, environment))
+                program.command += ["--skip", tests]
+    return programs + extra
+
+
+def quick(programs):
+    """The programs with unit tests, without the tests that need a GPU."""
+    programs = [program for program in programs if program.name.endswith(" unit")]
+    for program in programs:
+        program.environment.update(WITHOUT_GPU)
+        for tests in NOT_QUICK.get(program.name, ()):
+            program.command += ["--skip", tests]
+    return programs
+
+
+def package_name(package_id):
+    """`path+file:///folder/trainer#0.1.0` and `path+file:///folder#fieldrig@0.1.0` name packages."""
+    path, _, version = package_id.partition("#")
+    return version.split("@")[0] if "@" in version else path.rsplit("/", 1)[-1]
+
+
+def doc_tests(cargo_arguments):
+    """The examples in documentation, as one program."""
+    return Program("examples in documentation", ["cargo", "test", "--doc", *cargo_arguments], os.getcwd())
+
+
+class Runner:
+    """Runs programs, and prints a line for each."""
+
+    def __init__(self):
+        self.lock = threading.Lock()
+
+    def run_all(self, programs, processors):
+        for program in programs:
+            program.run(processors)
+            self.print_result(program)
+
+    def print_progress(self, programs):
+        """Prints every minute which programs run."""
+        while True:
+            time.sleep(60)
+            with self.lock:
+                for program in filter(Program.is_running, programs):
+                    print(f"           {program.name} is running, {program.n_finished()} tests so far", flush=True)
+
+    def print_result(self, program):
+        with self.lock:
+            if program.has_failed():
+                print(f"\n---- output of {program.name}\n{program.output}\n---- end of output of {program.name}\n")
+            n_passed, n_failed, n_skipped = program.counts()
+            text = f"{n_passed} passed" + f", {n_failed} failed" * (n_failed > 0) + f", {n_skipped} skipped" * (n_skipped > 0)
+            verdict = f"FAILED (exit status {program.status})" if program.has_failed() else "ok"
+            print(f"{program.secs:7.1f} s  {program.name}: {verdict}, {text}", flush=True)
+
+
+def run(programs):
+    """Runs all programs: those of BESIDE on one processor, the others on the rest until these have ended."""
+    runner = Runner()
+    threading.Thread(target=runner.print_progress, args=(programs,), daemon=True).start()
+    processors = sorted(os.sched_getaffinity(0))
+    beside = [program for program in programs if program.name in BESIDE]
+    others = [program for program in programs if program.name not in BESIDE]
+    if len(processors) == 1 or not beside:
+        runner.run_all(beside + others, processors)
+        return
+
+    def run_beside():
+        runner.run_all(beside, processors[-1:])
+        for program in others:
+            program.set_processors(processors)
+
+    thread = threading.Thread(target=run_beside)
+    thread.start()
+    for program in others:
+        runner.run_all([program], processors[:-1] if thread.is_alive() else processors)
+    thread.join()
+
+
+def report(steps, build_secs, test_secs, programs):
+    """The durations of all steps, programs and slowest tests, as Markdown."""
+    lines = ["| step | seconds |", "|---|---:|"]
+    lines += [f"| {name} | {secs:.0f} |" for name, secs in [*steps, ("build of the tests", build_secs), ("tests", test_secs)]]
+    total_secs = sum(secs for _, secs in steps) + build_secs + test_secs
+    lines += [f"| **total** | **{total_secs:.0f}** |", ""]
+    lines += ["| test program | seconds | passed | failed | skipped |", "|---|---:|---:|---:|---:|"]
+    for program in sorted(programs, key=lambda program: -program.secs):
+        n_passed, n_failed, n_skipped = program.counts()
+        lines.append(f"| {program.name} | {program.secs:.1f} | {n_passed} | {n_failed} | {n_skipped} |")
+    tests = [(secs, program.name, test) for program in programs for test, _, secs in program.tests]
+    lines += ["", f"| {N_SLOWEST} slowest tests | seconds |", "|---|---:|"]
+    lines += [f"| {name}: `{test}` | {secs:.1f} |" for secs, name, test in sorted(tests, reverse=True)[:N_SLOWEST]]
+    return "\n".join(lines)
+
+
+def read_steps(path):
+    """Names and seconds of earlier steps."""
+    if path is None or not path.exists():
+        return []
+    rows = (line.rsplit("\t", 1) for line in path.read_text().splitlines())
+    return [(name, float(secs)) for name, secs in rows]
+
+
+def summarize(programs):
+    """Prints skipped and failed tests, then the counts. Returns whether all tests passed."""
+    skipped = collections.defaultdict(list)
+    for program in programs:
+        for test, reason in program.skipped.items():
+            skipped[reason].append(f"{program.name}: {test}")
+    for reason, tests in sorted(skipped.items()):
+        print(f"\nskipped, because {reason}:")
+        for test in tests:
+            print(f"    {test}")
+    failed = [program for program in programs if program.has_failed()]
+    if failed:
+        print("\nfailed:")
+    for program in failed:
+        names = [test for test, result, _ in program.tests if result == "FAILED"]
+        print(f"    {program.name}: {', '.join(names) or f'exit status {program.status}'}")
+    n_passed, n_failed, n_skipped = (sum(counts) for counts in zip(*(program.counts() for program in programs)))
+    n_failed += sum(program.count("FAILED") == 0 for program in failed)
+    print(f"\n{n_passed} passed, {n_failed} failed, {n_skipped} skipped")
+    return not failed
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--steps", type=pathlib.Path)
+    parser.add_argument("--report", type=pathlib.Path)
+    parser.add_argument("--only", type=re.compile)
+    parser.add_argument("--filter")
+    parser.add_argument("--no-doc", action="store_true")
+    parser.add_argument("--quick", action="store_true")
+    parser.add_argument("cargo_arguments", nargs="*")
+    arguments = parser.parse_args()
+    since = time.monotonic()
+    built = build(arguments.cargo_arguments)
+    programs = quick(built) if arguments.quick else separated(built)
+    build_secs = time.monotonic() - since
+    if not arguments.no_doc:
+        programs.append(doc_tests(arguments.cargo_arguments))
+    if arguments.only:
+        programs = [program for program in programs if arguments.only.search(program.name)]
+    if arguments.filter:
+        for program in programs:
+            program.command.append(arguments.filter)
+    if not programs:
+        sys.exit("run-tests: no test program matches")
+    since = time.monotonic()
+    try:
+        run(programs)
+    except KeyboardInterrupt:
+        for program in programs:
+            program.stop()
+        sys.exit(130)
+    text = report(read_steps(arguments.steps), build_secs, time.monotonic() - since, programs)
+    print(f"\n{text}")
+    if arguments.report:
+        arguments.report.write_text(text + "\n")
+    sys.exit(0 if summarize(programs) else 1)
+
+
+if __name__ == "__main__":
+    main()
