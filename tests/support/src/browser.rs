@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 use tungstenite::{Message, WebSocket};
 
 /// Far more than a browser needs on two busy cores.
-const TIMEOUT: Duration = Duration::from_secs(60);
+const TIMEOUT: Duration = Duration::from_secs(300);
 
 /// A script for [`Browser::open_with`]: WebGL calls draw nothing, because drawing on the CPU takes most of the time.
 pub const NO_DRAWING: &str = include_str!("no_drawing.js");
