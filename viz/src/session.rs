@@ -19,11 +19,15 @@ use futures_util::StreamExt;
 use futures_util::stream::SplitStream;
 use serde::Deserialize;
 use std::sync::Arc;
-use std::time::Instant;
+use std::time::{Duration, Instant};
+use tokio::sync::mpsc::error::TrySendError;
 use tokio::sync::{mpsc, watch};
 
 /// Maximum number of unread replies. A client with more unread replies is disconnected.
 const MAX_REPLIES: usize = 64;
+/// After a goodbye, the connection stays open until the client closes it, but at most for this time. If it were closed while
+/// something from the client is unread, the kernel would reset it and discard what was not sent yet, including the goodbye.
+const LINGER: Duration = Duration::from_millis(300);
 
 /// Serves one client until either side disconnects.
 pub(crate) async fn serve(socket: WebSocket, connection: Arc<Connection>, role: Role, server_context: ServerContext) {
@@ -55,9 +59,13 @@ pub(crate) async fn serve(socket: WebSocket, connection: Arc<Connection>, role: 
         link,
         part_sent: Instant::now(),
     };
+    let mut reading = std::pin::pin!(reader.run());
     tokio::select! {
-        () = reader.run() => {}
-        _ = writer.run(&wake, waiting_replies, demand) => {}
+        () = &mut reading => {}
+        _ = writer.run(&wake, waiting_replies, demand) => {
+            // If the time is over, the client does not get a reply to its last messages.
+            let _ = tokio::time::timeout(LINGER, reading).await;
+        }
     }
     drop(client_guard);
     log::info!("client {client} disconnected");
@@ -91,12 +99,14 @@ impl Reader<'_> {
     async fn run(mut self) {
         while let Some(Ok(message)) = self.stream.next().await {
             let reply = match message {
+                Message::Close(_) => return,
+                // The writer has said goodbye.
+                _ if self.replies.is_closed() => return self.discard().await,
                 Message::Pong(_) => {
                     self.connection.record_pong();
                     continue;
                 }
                 Message::Ping(_) => continue,
-                Message::Close(_) => return,
                 Message::Text(text) => self
                     .answer(&text)
                     .unwrap_or_else(|error| Some(Reply::Error { id: id_of(&text), message: error.to_string() })),
@@ -108,13 +118,23 @@ impl Reader<'_> {
             self.connection.last_message();
             let Some(reply) = reply else { continue };
             let is_last = matches!(reply, Reply::Goodbye { .. });
-            if self.replies.try_send(reply).is_err() {
-                log::info!("client {} disconnected: it left {MAX_REPLIES} replies unread", self.client);
-                return;
+            match self.replies.try_send(reply) {
+                Ok(()) if is_last => return self.discard().await,
+                Ok(()) => {}
+                Err(TrySendError::Full(_)) => {
+                    log::info!("client {} disconnected: it left {MAX_REPLIES} replies unread", self.client);
+                    return;
+                }
+                Err(TrySendError::Closed(_)) => return self.discard().await,
             }
-            if is_last {
-                // The writer ends the session.
-                std::future::pending::<()>().await;
+        }
+    }
+
+    /// Reads until the client disconnects, and ignores what it sends: the writer ends the session, or has ended it.
+    async fn discard(&mut self) {
+        while let Some(Ok(message)) = self.stream.next().await {
+            if matches!(message, Message::Close(_)) {
+                return;
             }
         }
     }

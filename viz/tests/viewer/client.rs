@@ -1,6 +1,7 @@
 //! A blocking WebSocket client.
 
 use serde_json::Value;
+use std::io::ErrorKind;
 use std::net::{SocketAddr, TcpStream};
 use std::time::{Duration, Instant};
 use tungstenite::{Message, WebSocket};
@@ -15,6 +16,8 @@ pub(crate) struct Client {
     joined: Vec<u8>,
     /// Bytes of all messages received so far.
     n_received: usize,
+    /// The server has said that it closes the connection.
+    is_closing: bool,
 }
 
 /// One message from the server.
@@ -37,12 +40,17 @@ impl Client {
     pub(crate) fn over(stream: TcpStream, address: SocketAddr) -> Self {
         stream.set_read_timeout(Some(TIMEOUT)).expect("a timeout");
         let (socket, _) = tungstenite::client(format!("ws://{address}/ws"), stream).expect("a WebSocket");
-        Self { socket, joined: Vec::new(), n_received: 0 }
+        Self { socket, joined: Vec::new(), n_received: 0, is_closing: false }
     }
 
     /// Bytes of all messages received so far, without WebSocket headers.
     pub(crate) fn n_received(&self) -> usize {
         self.n_received
+    }
+
+    /// Bytes that have arrived so far. They include those that the kernel holds for this client.
+    pub(crate) fn n_arrived(&self) -> usize {
+        self.n_received + n_unread(self.socket.get_ref())
     }
 
     pub(crate) fn send_json(&mut self, message: &Value) {
@@ -79,11 +87,14 @@ impl Client {
                         whole => return whole,
                     }
                 }
-                Ok(Message::Close(_)) => {}
+                Ok(Message::Close(_)) => self.is_closing = true,
                 Ok(_) => {}
                 Err(tungstenite::Error::ConnectionClosed | tungstenite::Error::Protocol(_)) => return Received::End,
                 // The server has closed the connection before the reply to its close frame.
-                Err(tungstenite::Error::Io(error)) if error.kind() == std::io::ErrorKind::BrokenPipe => {
+                Err(tungstenite::Error::Io(error))
+                    if error.kind() == ErrorKind::BrokenPipe
+                        || self.is_closing && error.kind() == ErrorKind::ConnectionReset =>
+                {
                     return Received::End;
                 }
                 Err(error) => panic!("the connection broke: {error}"),
@@ -127,6 +138,12 @@ impl Client {
         }
         panic!("the expected message did not arrive");
     }
+}
+
+/// Bytes that have arrived over a connection but were not read yet.
+pub(crate) fn n_unread(stream: &TcpStream) -> usize {
+    let n_bytes = rustix::io::ioctl_fionread(stream).expect("a number of bytes");
+    n_bytes.try_into().expect("fits in memory")
 }
 
 fn unframe(bytes: &[u8]) -> Received {
