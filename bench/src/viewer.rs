@@ -419,15 +419,23 @@ mod tests {
             std::thread::sleep(Duration::from_millis(1));
         }
         assert!(shown[1..].iter().all(|picture| !picture.new_keyframes.is_empty()), "{shown:?}");
-        // The viewer estimates the server's clock to a fraction of a millisecond.
-        let decoding = shown.iter().map(|picture| picture.shown_at - picture.sent_at);
-        assert!(decoding.clone().all(|time| time < started.elapsed()) && decoding.max() > Some(Duration::ZERO));
+        // The viewer's estimate of the server's clock is wrong by less than a round trip, which is long on a busy computer.
+        let elapsed_secs = started.elapsed().as_secs_f64();
+        let decoding_secs: Vec<f64> =
+            shown.iter().map(|picture| secs_between(picture.sent_at, picture.shown_at)).collect();
+        assert!(decoding_secs.iter().all(|secs| secs.abs() < elapsed_secs), "{decoding_secs:?} of {elapsed_secs} s");
+        assert!(decoding_secs.iter().any(|secs| *secs != 0.0), "{decoding_secs:?}");
         assert!(n_drawn >= 4, "one failed request and three images, with one stage each if the server renders fast");
         drop(viewer);
         while hub.n_clients() > 0 {
             assert!(started.elapsed() < Duration::from_secs(60));
             std::thread::sleep(Duration::from_millis(1));
         }
+    }
+
+    /// Seconds from one time to another; negative if the other one is earlier.
+    fn secs_between(from: Instant, to: Instant) -> f64 {
+        to.duration_since(from).as_secs_f64() - from.duration_since(to).as_secs_f64()
     }
 
     #[test]

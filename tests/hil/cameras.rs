@@ -11,6 +11,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::{Duration, Instant};
+use test_support::{StalledTimes, Stalls};
 
 pub(crate) const WEBCAM: &str = "platform:vivid-000";
 const GRABBER: &str = "platform:vivid-001";
@@ -140,13 +141,39 @@ fn injected_drops_are_counted_exactly() {
     assert!((0.19..0.41).contains(&share), "lost a fraction of {share:.2}");
 }
 
-/// Waits for an image after a fault and returns it with the elapsed time.
-fn time_to_recover(camera: &mut V4l2Camera, start_time: Instant) -> (Image, Duration) {
+/// When a camera had a fault, and when it delivered images again.
+struct Recovery {
+    what: &'static str,
+    began: Instant,
+    ended: Instant,
+}
+
+impl Recovery {
+    fn since(what: &'static str, began: Instant) -> Self {
+        Self { what, began, ended: Instant::now() }
+    }
+
+    fn duration(&self) -> Duration {
+        self.ended - self.began
+    }
+}
+
+/// Without the time in which the machine stalled.
+fn assert_fast(recoveries: &[Recovery], stalled: &StalledTimes) {
+    for Recovery { what, began, ended } in recoveries {
+        let unstalled = stalled.unstalled(*began, *ended);
+        println!("{what}: recovered after {:.0?}", *ended - *began);
+        assert!(unstalled < Duration::from_secs(1), "{what}: {unstalled:?}");
+    }
+}
+
+/// Waits for an image after a fault.
+fn recovered_image(camera: &mut V4l2Camera, start_time: Instant) -> Image {
     loop {
         match camera.next_image(Duration::from_millis(100)) {
-            Ok(image) => return (image, start_time.elapsed()),
+            Ok(image) => return image,
             Err(Error::NoImage { .. } | Error::Reconnecting { .. }) => {
-                assert!(start_time.elapsed() < Duration::from_secs(5))
+                assert!(start_time.elapsed() < Duration::from_secs(30))
             }
             Err(other) => panic!("{other}"),
         }
@@ -177,34 +204,38 @@ fn unplugged_camera_reconnects_with_all_settings() {
     CapturedImages::capture(&mut camera, 0.5);
     assert_settings(&camera);
 
+    let (stalls, mut recoveries) = (Stalls::start(), Vec::new());
     for n_before in 0..3 {
         v4l2::set_control(&node(WEBCAM), DISCONNECT, 1).expect("vivid injects faults");
         // Images captured before may still arrive.
         let start_time = Instant::now();
         let image = loop {
-            let (image, elapsed) = time_to_recover(&mut camera, start_time);
+            let image = recovered_image(&mut camera, start_time);
             if camera.counts().n_reconnections > n_before {
-                println!("disconnected: recovered after {elapsed:.0?}, {} images counted as lost", image.n_skipped);
-                assert!(elapsed < Duration::from_secs(1), "{elapsed:?}");
                 break image;
             }
         };
-        assert!(image.n_skipped <= 25, "{}", image.n_skipped);
+        recoveries.push(Recovery::since("disconnected", start_time));
+        let max_lost = recoveries[recoveries.len() - 1].duration().as_secs_f64() * rate_hz + 1.0;
+        assert!(image.n_skipped as f64 <= max_lost, "{} images counted as lost, at most {max_lost}", image.n_skipped);
         assert_settings(&camera);
     }
 
     write_driver_action("unbind");
     let unplugged_at = Instant::now();
     while !matches!(camera.next_image(Duration::from_millis(50)), Err(Error::Reconnecting { .. })) {
-        assert!(unplugged_at.elapsed() < Duration::from_secs(2), "the driver did not detect the outage");
+        assert!(unplugged_at.elapsed() < Duration::from_secs(30), "the driver did not detect the outage");
     }
     std::thread::sleep(Duration::from_secs(1).saturating_sub(unplugged_at.elapsed()));
     write_driver_action("bind");
-    let (image, elapsed) = time_to_recover(&mut camera, Instant::now());
-    println!("reconnected: recovered after {elapsed:.0?}, {} images counted as lost", image.n_skipped);
-    assert!(elapsed < Duration::from_secs(1), "{elapsed:?}");
-    // One second without a camera, plus the time to bind it.
-    assert!((20..=60).contains(&image.n_skipped), "{} images counted for the outage", image.n_skipped);
+    let bound_at = Instant::now();
+    let image = recovered_image(&mut camera, bound_at);
+    recoveries.push(Recovery::since("connected again", bound_at));
+    // At least one second without a camera, plus the time to bind it.
+    let max_lost = unplugged_at.elapsed().as_secs_f64() * rate_hz + 10.0;
+    let lost_range = 20.0..=max_lost;
+    assert!(lost_range.contains(&(image.n_skipped as f64)), "{} images lost, expected {lost_range:?}", image.n_skipped);
+    assert_fast(&recoveries, &stalls.stop());
     assert_settings(&camera);
     CapturedImages::capture(&mut camera, 2.0).report("after reconnecting", rate_hz);
 }
@@ -221,7 +252,7 @@ fn missing_camera_is_an_error_after_timeout() {
     let error = loop {
         match camera.next_image(Duration::from_millis(100)) {
             Ok(_) | Err(Error::Reconnecting { .. }) => {
-                assert!(start_time.elapsed() < 5 * wait, "the driver did not give up")
+                assert!(start_time.elapsed() < 30 * wait, "the driver did not give up")
             }
             Err(error) => break error.to_string(),
         }
@@ -229,7 +260,7 @@ fn missing_camera_is_an_error_after_timeout() {
     write_driver_action("bind");
     println!("not reconnected: {error}");
     assert!(error.contains("\"front\"") && error.contains("did not reconnect within"), "{error}");
-    assert!(start_time.elapsed() >= wait && start_time.elapsed() < 2 * wait, "{:?}", start_time.elapsed());
+    assert!(start_time.elapsed() >= wait, "{:?}", start_time.elapsed());
 }
 
 #[test]
@@ -249,16 +280,24 @@ fn silent_camera_is_restarted_and_then_given_up() {
         assert!(matches!(result, Ok(_) | Err(Error::NoImage { .. } | Error::Reconnecting { .. })), "{result:?}");
     }
     set_drop_percent(0);
-    let (image, _) = time_to_recover(&mut camera, Instant::now());
-    println!("silent for 3 s: restarted {} times, {} images lost", camera.counts().n_reconnections, image.n_skipped);
+    let image = recovered_image(&mut camera, Instant::now());
+    let secs = start_time.elapsed().as_secs_f64();
+    println!(
+        "silent: restarted {} times, {} images lost in {secs:.2} s",
+        camera.counts().n_reconnections,
+        image.n_skipped
+    );
     assert_eq!(camera.counts().n_reconnections, 1);
-    assert!((70..=100).contains(&image.n_skipped), "{} images lost in 3 s at 25 Hz", image.n_skipped);
+    let lost_range = 70.0..=25.0 * secs + 10.0;
+    assert!(lost_range.contains(&(image.n_skipped as f64)), "{} lost, expected {lost_range:?}", image.n_skipped);
     // If the camera stays silent, the driver reopens it repeatedly and then gives up.
     set_drop_percent(100);
     let start_time = Instant::now();
     let error = loop {
         match camera.next_image(Duration::from_millis(100)) {
-            Ok(_) | Err(Error::NoImage { .. } | Error::Reconnecting { .. }) => assert!(start_time.elapsed() < 3 * wait),
+            Ok(_) | Err(Error::NoImage { .. } | Error::Reconnecting { .. }) => {
+                assert!(start_time.elapsed() < 12 * wait)
+            }
             Err(error) => break error.to_string(),
         }
     };
@@ -282,10 +321,12 @@ fn damaged_images_and_broken_streams_are_counted_and_recovered() {
     assert!(n_lost >= 3, "{n_lost}: a busy machine may lose more");
     assert_eq!(camera.counts().n_reconnections, 0, "a damaged image does not restart the stream");
 
+    let stalls = Stalls::start();
     v4l2::set_control(&node(WEBCAM), BREAK_STREAM, 1).expect("vivid injects faults");
-    let (_, elapsed) = time_to_recover(&mut camera, Instant::now());
-    println!("failed stream: recovered after {elapsed:.0?}");
-    assert!(elapsed < Duration::from_secs(1) && camera.counts().n_reconnections == 1);
+    let broken_at = Instant::now();
+    recovered_image(&mut camera, broken_at);
+    assert_fast(&[Recovery::since("failed stream", broken_at)], &stalls.stop());
+    assert_eq!(camera.counts().n_reconnections, 1);
     drop(camera);
 
     v4l2::set_control(&node(WEBCAM), REFUSE_STREAM, 1).expect("vivid injects faults");
@@ -335,23 +376,23 @@ fn newest_image_is_delivered_if_configured() {
     let deliver = |delivery| {
         let mut camera =
             V4l2Camera::open(Config { delivery, ..config(WEBCAM, [640, 360], rate_hz) }).expect("vivid opens");
-        let mut images = Vec::new();
+        let (mut images, mut ages_secs) = (Vec::new(), Vec::new());
         for _ in 0..8 {
             std::thread::sleep(Duration::from_millis(200));
-            images.push(camera.next_image(Duration::from_secs(2)).expect("vivid streams"));
+            let image = camera.next_image(Duration::from_secs(2)).expect("vivid streams");
+            ages_secs.push((drivers::clock::now().0 - image.stamp.0) as f64 * 1e-9);
+            images.push(image);
         }
-        let age_secs = (drivers::clock::now().0 - images.last().expect("eight").stamp.0) as f64 * 1e-9;
-        (
-            CapturedImages { images, elapsed: Duration::default() }
-                .report(&format!("{delivery:?}, every 200 ms"), rate_hz),
-            age_secs,
-        )
+        let captured = CapturedImages { images, elapsed: Duration::default() };
+        (captured.report(&format!("{delivery:?}, every 200 ms"), rate_hz), ages_secs)
     };
-    let ((_, n_lost), age_secs_of) = deliver(Delivery::Newest);
+    let ((_, n_lost), mut ages_secs) = deliver(Delivery::Newest);
     assert!(n_lost >= 20, "{n_lost} images lost at five images per 200 ms");
-    assert!(age_secs_of < 0.15, "the newest image is {age_secs_of} s old");
-    let (_, age_secs_of) = deliver(Delivery::Every);
-    assert!(age_secs_of > 0.2, "the oldest queued image is only {age_secs_of} s old");
+    // The median, because the machine may stall.
+    ages_secs.sort_by(f64::total_cmp);
+    assert!(ages_secs[4] < 0.15, "the newest images are {ages_secs:?} s old");
+    let (_, ages_secs) = deliver(Delivery::Every);
+    assert!(ages_secs[7] > 0.2, "the oldest queued images are only {ages_secs:?} s old");
 }
 
 #[test]

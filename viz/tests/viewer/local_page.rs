@@ -16,7 +16,7 @@ use viz::{
     Hub, LiveImage, LivePixels, ModelStatus, ObservationMap, ObservedCell, SceneHint, Server, ServerConfig, Status,
 };
 
-const WINDOW_PX: [u32; 2] = [1000, 640];
+const WINDOW_PX: [u32; 2] = [720, 480];
 /// Required PSNR of the page's own drawing against the server's picture, dB.
 const MIN_DB: f64 = 30.0;
 /// Part of the view that nothing else covers: distance from its top and bottom edges, pixels.
@@ -165,10 +165,10 @@ fn local_drawing_equals_the_pictures_of_the_server() {
 
     // The view moves without pictures from the server, which is asked only for depth when the view rests.
     let (before, n_color_requests) = (thread.last_request(), thread.n_color_requests());
-    let [x, y] = [400, 300];
+    let [x, y] = [300, 240];
     browser.mouse("mousePressed", [x, y]);
-    for step in 1..=10 {
-        browser.mouse("mouseMoved", [x + 4 * step, y]);
+    for step in 1..=4 {
+        browser.mouse("mouseMoved", [x + 10 * step, y]);
         browser.next_frame();
     }
     browser.mouse("mouseReleased", [x + 40, y]);

@@ -21,6 +21,7 @@ mod robot_page;
 mod shared;
 mod shared_page;
 mod shown_pictures;
+mod slow;
 mod tls;
 mod unsupported_page;
 mod video_page;

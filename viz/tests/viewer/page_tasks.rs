@@ -17,8 +17,9 @@ use viz::{Hub, KeyframePose, LiveImage, LivePixels, ModelStatus, SceneHint, Serv
 const WINDOW_PX: [u32; 2] = [1280, 720];
 const N_KEYFRAMES: i64 = 400;
 const DURATION: Duration = Duration::from_secs(8);
-/// Limit of the 99th percentile. The goal is 4 ms on an idle computer; other tests run beside this one.
-const MAX_P99_MILLIS: f64 = 16.0;
+/// Limit of the 99th percentile of the CPU time of tasks; the goal is 4 ms. CPU time hardly depends on the tests that run beside
+/// this one.
+const MAX_P99_MILLIS: f64 = 8.0;
 
 fn keyframe(stamp: i64) -> KeyframePose {
     KeyframePose {
@@ -101,11 +102,11 @@ fn tasks_of_the_main_thread_are_short() {
         tasks
     });
     std::fs::remove_dir_all(&profile).expect("the browser has left its profile");
-    let mut tasks: Vec<f64> = tasks.iter().map(|task| task.millis).collect();
+    let mut tasks: Vec<f64> = tasks.iter().map(|task| task.cpu_millis).collect();
     tasks.sort_by(f64::total_cmp);
     let percentile = |share: usize| tasks[(tasks.len() - 1) * share / 1000];
     eprintln!(
-        "{} tasks: median {:.2} ms, 99 % {:.2} ms, 99.9 % {:.2} ms, longest {:.2} ms",
+        "{} tasks, CPU time: median {:.2} ms, 99 % {:.2} ms, 99.9 % {:.2} ms, longest {:.2} ms",
         tasks.len(),
         percentile(500),
         percentile(990),

@@ -1,6 +1,7 @@
 //! A TCP proxy that imitates a wireless link: limited rate, delay, and delayed segments. The link can be cut: connections
 //! stay open, but nothing passes until it is restored.
 
+use crate::slow::connect_with_buffer;
 use std::io::{Read, Write};
 use std::net::{Shutdown, SocketAddr, TcpListener, TcpStream};
 use std::sync::Arc;
@@ -11,6 +12,8 @@ use std::time::{Duration, Instant};
 /// Segments that the link buffers in each direction.
 const MAX_SEGMENTS: usize = 256;
 const SEGMENT_BYTES: usize = 1460;
+/// Receive buffer of the link towards the server.
+const RECEIVE_BUFFER_BYTES: usize = 65_536;
 
 /// Properties of a link, the same in both directions.
 #[derive(Clone, Copy, Debug)]
@@ -40,7 +43,7 @@ impl Proxy {
         let is_cut_here = Arc::clone(&is_cut);
         std::thread::spawn(move || {
             for client in listener.incoming().map_while(Result::ok) {
-                let Ok(server) = TcpStream::connect(server) else { continue };
+                let Ok(server) = connect_with_buffer(server, RECEIVE_BUFFER_BYTES) else { continue };
                 let ends = [&client, &server].map(|stream| stream.try_clone().expect("a descriptor"));
                 let [client_too, server_too] = ends;
                 for (from, to) in [(client, server_too), (server, client_too)] {
