@@ -4,7 +4,7 @@
 use super::growth_search::FEW_IMAGES;
 use super::training_tests::{FEW_STEPS, n_keyframes, noisy, options, train};
 use super::trials::CountPolicy;
-use super::{SplatOptions, SplatTrainer, TrialSteps};
+use super::{SplatOptions, SplatTrainer};
 use crate::Method;
 use crate::checkpoint::Checkpoint;
 use crate::gpu::Gpu;
@@ -138,29 +138,29 @@ fn many_images_are_not_tested() {
 /// A keyframe that arrives during a search restarts it. A checkpoint continues with the same result.
 #[test]
 fn interrupted_search_is_repeated() {
-    // With fewer steps, the search takes several rounds.
-    let steps = TrialSteps::default();
-    let end = steps.search + steps.search_pause + 50;
+    const END: u64 = FEW_STEPS.search + FEW_STEPS.search_pause + 50;
     let gpu = test_gpu();
-    let keyframes = without_validation(n_keyframes(&gpu, 12, true));
+    // With noise, the search ends after one round.
+    let keyframes = without_validation(noisy(&n_keyframes(&gpu, 12, true)));
     let start_search = || {
         // The repeated search starts before growth ends.
-        let options = tested().with(|options| {
-            options.common.n_planned_steps = 3200;
-            options.specific.trial_steps = steps;
-        });
+        let options = tested().with(|options| options.common.n_planned_steps = 2 * N_PLANNED_STEPS);
         let mut trainer = new_trainer(&gpu, options, &keyframes[..11]);
-        train(&mut trainer, steps.search);
+        train(&mut trainer, FEW_STEPS.search);
         let n_before = trainer.progress().primitives;
         trainer.step(30).unwrap();
         assert!(trainer.is_growth_search_running());
-        assert_eq!((trainer.progress().step, trainer.progress().primitives), (steps.search, n_before), "not displayed");
+        assert_eq!(
+            (trainer.progress().step, trainer.progress().primitives),
+            (FEW_STEPS.search, n_before),
+            "not displayed"
+        );
         trainer
     };
     let finish = |trainer: &mut SplatTrainer| {
         trainer.push(keyframes[11].clone()).unwrap();
         assert!(!trainer.is_growth_search_running());
-        let n_left = end - trainer.progress().step;
+        let n_left = END - trainer.progress().step;
         train(trainer, n_left);
         assert_eq!(doublings(trainer).len(), 1, "{:?}", trainer.trials());
         checkpoint_of(trainer)
@@ -178,5 +178,5 @@ fn interrupted_search_is_repeated() {
     let n_before = saved.progress().primitives;
     saved.save(tempfile::tempdir().unwrap().path()).unwrap();
     assert_eq!(saved.arrays().unwrap().n_splats() as u64, n_before);
-    assert_eq!((saved.progress().step, saved.n_total_steps().unwrap() > steps.search), (steps.search, true));
+    assert_eq!((saved.progress().step, saved.n_total_steps().unwrap() > FEW_STEPS.search), (FEW_STEPS.search, true));
 }

@@ -213,10 +213,10 @@ mod tests {
         let gpu = test_gpu();
         let clean = n_keyframes(&gpu, 36, false); // Without depth, training starts at the maximum number of splats.
         let keyframes = noisy(&clean);
-        let mut tested = trained(CountPolicy::Tested, &keyframes, gpu.clone(), 1750);
-        let mut again = trained(CountPolicy::Tested, &keyframes, gpu, 1750);
+        let mut tested = trained(CountPolicy::Tested, &keyframes, gpu.clone(), 1050);
+        let mut again = trained(CountPolicy::Tested, &keyframes, gpu, 1050);
         assert!(again.arrays().unwrap() == tested.arrays().unwrap());
-        train(&mut tested, 1200);
+        train(&mut tested, 1900);
         let reported: Vec<Trial> = tested.trials().to_vec();
         assert!(
             reported.iter().any(|trial| matches!(trial.candidate, Candidate::Halved { .. }) && trial.kept),
