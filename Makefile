@@ -5,7 +5,7 @@
 
 .DEFAULT_GOAL := help
 .PHONY: help demo test quick test-gpu hil check fuzz deps web cargo packages test-packages check-packages mujoco realsense open-ends \
-	begin-test lint doc kernels manifests licenses
+	begin-test lint lint-without-features doc kernels manifests licenses
 # Cargo and npm already use all processors, and two runs of apt would block each other.
 .NOTPARALLEL:
 
@@ -16,8 +16,8 @@ FEATURES := --features sim
 TEST_FEATURES = $(FEATURES),nokhwa,foxglove$(shell [ -e .deps/realsense/made-of ] && \
 	scripts/install-packages.sh --check realsense 2>/dev/null && echo ,realsense)
 
-# The crates whose code depends on features.
-CONDITIONAL := --package fieldrig --package capture --package drivers --package trainer --package viz
+# The crates whose code depends on features, and one that makes them share dependencies with the others (tests/features).
+CONDITIONAL := --package test-features --package fieldrig --package capture --package drivers --package trainer --package viz
 
 # Folder of everything that cargo builds.
 TARGET_FOLDER := $(or $(CARGO_TARGET_DIR),target)
@@ -37,7 +37,7 @@ demo: deps web ## Simulate a rig (RIG=static-arm, mobile-arm, mobile-base-small,
 	cargo build --release $(FEATURES)
 	$(TARGET_FOLDER)/release/fieldrig run rigs/$(RIG).toml --sim
 
-test: begin-test test-packages lint doc manifests licenses web ## Run lints, documentation and all tests that need no device
+test: begin-test test-packages lint lint-without-features doc manifests licenses web ## Run lints, documentation and all tests that need no device
 	@scripts/run-tests.py --steps $(STEPS) --report $(TARGET_FOLDER)/test-times.md -- --workspace $(TEST_FEATURES)
 
 quick: begin-test lint ## Run lints and the tests that need neither a GPU nor a browser
@@ -54,11 +54,13 @@ hil: cargo packages web ## Check the devices of the rig RIG=file.toml: reads all
 	cargo build --release $(shell pkg-config --exists realsense2 2>/dev/null && echo --features realsense)
 	$(TARGET_FOLDER)/release/fieldrig doctor $(if $(filter file,$(origin RIG)),$(error RIG is not set; run: make hil RIG=file.toml),$(RIG)) --listen $(LISTEN_SECONDS)
 
-check: lint doc kernels manifests licenses ## Check format, clippy, documentation, kernels, licenses, to-do markers
+check: lint lint-without-features doc kernels manifests licenses ## Check format, clippy, documentation, kernels, licenses, to-do markers
 
 lint: check-packages deps realsense open-ends
 	@$(STEP) format cargo fmt --all --check
 	@$(STEP) clippy cargo clippy --workspace --all-targets $(TEST_FEATURES) -- -D warnings
+
+lint-without-features: lint
 	@$(STEP) "clippy without features" cargo clippy $(CONDITIONAL) --all-targets --no-default-features --no-deps -- -D warnings
 
 doc: lint

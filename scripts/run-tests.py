@@ -27,14 +27,22 @@ import tempfile
 import threading
 import time
 
-# Programs that use a single processor and are sensitive to timing. They run on the last processor, beside all other
-# programs, which then use the remaining processors.
+# Programs that use a single processor and are sensitive to timing. They run on the last processor beside all other programs, with
+# a higher priority if this user may set it.
 BESIDE = ("fieldrig hil",)
 # Tests that need other settings than the rest of their program: program, part of the names of the tests, environment. Mesa's
 # software Vulkan has subgroups of 16 lanes with this width, so that the kernels for GPUs run, too.
 SEPARATE = (("trainer unit", "needs_large_subgroups", {"LP_NATIVE_VECTOR_WIDTH": "512"}),)
+# Programs that only compute. They run one after another beside all others, with a lower priority, and use the time in which the
+# others wait for clocks, devices and browsers.
+COMPUTING = (
+    "trainer unit", "trainer unit needs_large_subgroups", "calibration unit", "sim rigs", "sim unit", "targets accuracy",
+    "targets photos", "examples in documentation",
+)
+# Steps by which a priority differs. A program with a priority that is lower by 10 gets a tenth of a busy processor.
+NICE = 10
 # Programs that start first, because they take longest. The others follow in the order of their names.
-FIRST = ("trainer unit",)
+FIRST = ("fieldrig program", "trainer unit")
 # With --quick: only programs with unit tests, without these modules, whose tests need a GPU. No GPU is visible to the programs,
 # so a test that needs one fails unless its module is listed here.
 WITHOUT_GPU = {"VK_DRIVER_FILES": "/dev/null", "VK_ICD_FILENAMES": "/dev/null"}
@@ -58,7 +66,7 @@ class Program:
     def __init__(self, name, command, folder, environment=()):
         self.name, self.command, self.folder = name, command, folder
         self.environment = dict(environment)
-        self.secs = 0.0
+        self.secs = self.processor_secs = 0.0
         self.process = None
         self.output_path = None
         self.status = None
@@ -78,20 +86,19 @@ class Program:
     def has_failed(self):
         return self.status != 0
 
-    def run(self, processors):
-        """Runs the program on some processors."""
+    def run(self, processors, nice=0):
+        """Runs the program on some processors, with a priority that is lower by `nice`."""
         since = time.monotonic()
-        # The option for times is unstable; RUSTC_BOOTSTRAP allows it, here only for programs that are already built. Mesa's
-        # software Vulkan runs kernels on the calling thread, which takes a third less computing time than handing parts of
-        # them to other threads: tests run in parallel anyway.
-        environment = dict(os.environ, RUSTC_BOOTSTRAP="1", LP_NUM_THREADS="0", **self.environment)
+        # Mesa's software Vulkan runs kernels on the calling thread, which takes a third less computing time than handing parts
+        # of them to other threads: tests run in parallel anyway.
+        environment = dict(os.environ, LP_NUM_THREADS="0", **self.environment)
         # With a single thread, the harness prints a line in two parts, and the output of the test comes between them.
         environment["RUST_TEST_THREADS"] = str(max(2, os.cpu_count()))
         with tempfile.TemporaryDirectory() as folder, open(pathlib.Path(folder, "output"), "w+b") as output:
             self.output_path = pathlib.Path(folder, "output")
             skipped = pathlib.Path(folder, "skipped")
             environment["FIELDRIG_SKIPPED_TESTS"] = str(skipped)
-            # A process group of its own, so that `set_processors` finds the programs that it starts.
+            # A process group of its own, so that `stop` ends the programs that it starts.
             self.process = subprocess.Popen(
                 self.command,
                 cwd=self.folder,
@@ -99,9 +106,9 @@ class Program:
                 stdin=subprocess.DEVNULL,
                 stdout=output,
                 stderr=subprocess.STDOUT,
-                preexec_fn=lambda: (os.setpgrp(), os.sched_setaffinity(0, processors)),
+                preexec_fn=lambda: (os.setpgrp(), os.sched_setaffinity(0, processors), change_priority(nice)),
             )
-            self.status = self.process.wait()
+            self.wait()
             output.seek(0)
             self.output = output.read().decode(errors="replace")
             if skipped.exists():
@@ -110,8 +117,14 @@ class Program:
         self.secs = time.monotonic() - since
         self.tests = tests_in(self.output)
 
+    def wait(self):
+        """Waits for the process, and measures the computing time of it and of the programs that it has waited for."""
+        _, status, usage = os.wait4(self.process.pid, 0)
+        self.process.returncode = self.status = os.waitstatus_to_exitcode(status)
+        self.processor_secs = usage.ru_utime + usage.ru_stime
+
     def is_running(self):
-        return self.process is not None and self.process.poll() is None
+        return self.process is not None and self.process.returncode is None
 
     def n_finished(self):
         """Number of tests that have finished so far."""
@@ -120,23 +133,18 @@ class Program:
         except OSError:
             return 0  # The program has just ended.
 
-
-    def set_processors(self, processors):
-        """Moves the running program, and all programs that it has started, to other processors."""
-        if not self.is_running():
-            return
-        for task in pathlib.Path("/proc").glob("[0-9]*/task/*"):
-            try:
-                fields = pathlib.Path(task, "stat").read_text().rpartition(")")[2].split()
-                if int(fields[2]) == self.process.pid:
-                    os.sched_setaffinity(int(task.name), processors)
-            except OSError:
-                pass  # The task has ended meanwhile.
-
     def stop(self):
         """Ends the program and all programs that it has started."""
         if self.is_running():
             os.killpg(self.process.pid, signal.SIGTERM)
+
+
+def change_priority(nice):
+    """Lowers the priority of this process by `nice`. A negative number raises it, if this user may do so."""
+    try:
+        os.nice(nice)
+    except PermissionError:
+        pass
 
 
 def tests_in(output):
@@ -162,10 +170,12 @@ def build(cargo_arguments):
             if is_unit and target["kind"] == ["bin"]:
                 name += " (program)"
             arguments = ["-Z", "unstable-options", "--report-time"]
-            programs.append(Program(name, [message["executable"], *arguments], folder))
+            # The option for times is unstable; this variable allows it. Not for cargo, which would compile dependencies again.
+            programs.append(Program(name, [message["executable"], *arguments], folder, {"RUSTC_BOOTSTRAP": "1"}))
     if cargo.returncode != 0:
         sys.exit(cargo.returncode)
-    return sorted(programs, key=lambda program: (program.name not in FIRST, program.name))
+    rank = {name: number for number, name in enumerate(FIRST)}
+    return sorted(programs, key=lambda program: (rank.get(program.name, len(rank)), program.name))
 
 
 def separated(programs):
@@ -174,6 +184,7 @@ def separated(programs):
     for program in programs:
         for name, tests, environment in SEPARATE:
             if program.name == name:
+                environment = {**program.environment, **environment}
                 extra.append(Program(f"{name} {tests}", [*program.command, tests], program.folder, environment))
                 program.command += ["--skip", tests]
     return programs + extra
@@ -206,9 +217,9 @@ class Runner:
     def __init__(self):
         self.lock = threading.Lock()
 
-    def run_all(self, programs, processors):
+    def run_all(self, programs, processors, nice=0):
         for program in programs:
-            program.run(processors)
+            program.run(processors, nice)
             self.print_result(program)
 
     def print_progress(self, programs):
@@ -230,26 +241,22 @@ class Runner:
 
 
 def run(programs):
-    """Runs all programs: those of BESIDE on one processor, the others on the rest until these have ended."""
+    """Runs all programs: those of BESIDE on one processor, those that only compute with a low priority, and the others."""
     runner = Runner()
     threading.Thread(target=runner.print_progress, args=(programs,), daemon=True).start()
     processors = sorted(os.sched_getaffinity(0))
     beside = [program for program in programs if program.name in BESIDE]
-    others = [program for program in programs if program.name not in BESIDE]
-    if len(processors) == 1 or not beside:
-        runner.run_all(beside + others, processors)
-        return
-
-    def run_beside():
-        runner.run_all(beside, processors[-1:])
-        for program in others:
-            program.set_processors(processors)
-
-    thread = threading.Thread(target=run_beside)
-    thread.start()
-    for program in others:
-        runner.run_all([program], processors[:-1] if thread.is_alive() else processors)
-    thread.join()
+    computing = [program for program in programs if program.name in COMPUTING]
+    others = [program for program in programs if program not in beside + computing]
+    threads = [
+        threading.Thread(target=runner.run_all, args=(beside, processors[-1:], -NICE)),
+        threading.Thread(target=runner.run_all, args=(computing, processors, NICE)),
+    ]
+    for thread in threads:
+        thread.start()
+    runner.run_all(others, processors)
+    for thread in threads:
+        thread.join()
 
 
 def report(steps, build_secs, test_secs, programs):
@@ -258,10 +265,11 @@ def report(steps, build_secs, test_secs, programs):
     lines += [f"| {name} | {secs:.0f} |" for name, secs in [*steps, ("build of the tests", build_secs), ("tests", test_secs)]]
     total_secs = sum(secs for _, secs in steps) + build_secs + test_secs
     lines += [f"| **total** | **{total_secs:.0f}** |", ""]
-    lines += ["| test program | seconds | passed | failed | skipped |", "|---|---:|---:|---:|---:|"]
+    lines += ["| test program | seconds | of a processor | passed | failed | skipped |", "|---|---:|---:|---:|---:|---:|"]
     for program in sorted(programs, key=lambda program: -program.secs):
         n_passed, n_failed, n_skipped = program.counts()
-        lines.append(f"| {program.name} | {program.secs:.1f} | {n_passed} | {n_failed} | {n_skipped} |")
+        secs = f"{program.secs:.1f} | {program.processor_secs:.1f}"
+        lines.append(f"| {program.name} | {secs} | {n_passed} | {n_failed} | {n_skipped} |")
     tests = [(secs, program.name, test) for program in programs for test, _, secs in program.tests]
     lines += ["", f"| {N_SLOWEST} slowest tests | seconds |", "|---|---:|"]
     lines += [f"| {name}: `{test}` | {secs:.1f} |" for secs, name, test in sorted(tests, reverse=True)[:N_SLOWEST]]

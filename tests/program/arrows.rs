@@ -5,13 +5,14 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::process::Command;
 
 /// Every crate, and the workspace crates that it may depend on.
-const ALLOWED: [(&str, &[&str]); 13] = [
+const ALLOWED: [(&str, &[&str]); 14] = [
     ("kinematics", &[]),
     ("keyframe", &["kinematics"]),
     ("calibration", &["keyframe", "kinematics"]),
     ("drivers", &["kinematics"]),
     ("sim", &["drivers", "kinematics", "targets"]),
     ("targets", &["kinematics"]),
+    ("test-features", &[]),
     ("test-support", &[]),
     ("capture", &["calibration", "drivers", "keyframe", "kinematics", "sim"]),
     ("trainer", &["calibration", "keyframe", "kinematics"]),
@@ -101,14 +102,18 @@ fn forbidden_dependency_is_detected() {
     assert_eq!(violations(&dependencies), expected);
 }
 
-/// Without an entry, a crate would be compiled like a dependency: slowly, and without line numbers in backtraces.
+/// Dependencies are compiled without checks of overflow and without debug assertions, the crates of this workspace with them.
 #[test]
-fn every_crate_has_a_development_profile() {
+fn every_crate_is_checked_in_development() {
+    const CHECKS: [&str; 2] = ["debug-assertions", "overflow-checks"];
     let manifest = std::fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/Cargo.toml")).expect("a manifest");
     let manifest: toml::Table = manifest.parse().expect("TOML");
-    let profiles = manifest["profile"]["dev"]["package"].as_table().expect("a table");
-    for (name, _) in ALLOWED {
-        let debug = profiles.get(name).and_then(|profile| profile.get("debug")?.as_str());
-        assert_eq!(debug, Some("line-tables-only"), "the profile of {name}");
+    let profile = manifest["profile"]["dev"].as_table().expect("a table");
+    let packages = profile["package"].as_table().expect("a table");
+    for check in CHECKS {
+        assert!(packages["*"].get(check).is_some() && !profile.contains_key(check), "{check}");
+        for (name, _) in ALLOWED {
+            assert!(packages.get(name).is_none_or(|package| package.get(check).is_none()), "{check} of {name}");
+        }
     }
 }
