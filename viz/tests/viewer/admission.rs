@@ -251,6 +251,16 @@ fn server_sends_heartbeats() {
     let (hub, server) = start();
     let mut client = Client::connect(server.address());
     let mut times_millis = vec![client.text()["clock_millis"].as_f64().expect("a time")];
+    let is_over: Arc<AtomicBool> = Arc::default();
+    let is_over_here = Arc::clone(&is_over);
+    let timer = std::thread::spawn(move || {
+        let mut n_ticks = 0;
+        while !is_over_here.load(Ordering::Relaxed) {
+            std::thread::sleep(Duration::from_millis(500));
+            n_ticks += 1;
+        }
+        n_ticks
+    });
     let started = Instant::now();
     while times_millis.len() <= N_HEARTBEATS {
         times_millis.push(client.text_of("heartbeat")["clock_millis"].as_f64().expect("a time"));
@@ -259,10 +269,10 @@ fn server_sends_heartbeats() {
     assert!(times_millis.is_sorted(), "the clock runs backward: {times_millis:?}");
     let sent_millis = times_millis[N_HEARTBEATS] - times_millis[1];
     assert!((1000.0..elapsed_millis + 100.0).contains(&sent_millis), "{sent_millis} of {elapsed_millis} ms");
-    // The median, because this computer may be too busy for a while.
-    let mut pauses: Vec<f64> = times_millis[1..].windows(2).map(|pair| pair[1] - pair[0]).collect();
-    pauses.sort_by(f64::total_cmp);
-    assert!(pauses[pauses.len() / 2] < 500.0, "pauses of {pauses:?} ms");
+    // A timer of this test with twice the documented period of 250 ms; on a busy computer, it is late, too.
+    is_over.store(true, Ordering::Relaxed);
+    let n_ticks = timer.join().expect("no panic");
+    assert!(n_ticks <= N_HEARTBEATS, "{N_HEARTBEATS} heartbeats in {n_ticks} periods of 500 ms");
     drop(hub);
 }
 

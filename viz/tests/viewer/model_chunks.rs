@@ -207,6 +207,8 @@ fn models_do_not_delay_other_messages() {
     /// What the server sends before a reply that it has not yet handed to the kernel, and what the link and both ends hold:
     /// measured 0.6 to 0.8 MB.
     const MAX_BYTES_BEFORE_REPLY: usize = 1_500_000;
+    /// If the server paused between chunks, the link would be empty when most pings arrive.
+    const MIN_MEAN_BYTES_BEFORE_REPLY: usize = 100_000;
     let (hub, server) = start();
     let thread = ModelThread::start(hub, vec![("splat", Box::new(splat_model(&wall(150_000))))]);
     let proxy = Proxy::start(server.address(), LINK);
@@ -240,5 +242,7 @@ fn models_do_not_delay_other_messages() {
     assert!(n_coarse.is_some_and(|n_coarse| 10 * n_coarse < 3 * n_bytes), "{n_coarse:?} of {n_bytes} bytes");
     let most = n_before_replies.iter().max().expect("replies");
     assert!(*most < MAX_BYTES_BEFORE_REPLY, "{most} bytes were sent before a reply: {n_before_replies:?}");
+    let mean = n_before_replies.iter().sum::<usize>() / n_before_replies.len();
+    assert!(mean > MIN_MEAN_BYTES_BEFORE_REPLY, "the link is not used: {n_before_replies:?} bytes before replies");
     drop(thread.finish());
 }
