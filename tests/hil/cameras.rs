@@ -11,7 +11,6 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::{Duration, Instant};
-use test_support::{StalledTimes, Stalls};
 
 pub(crate) const WEBCAM: &str = "platform:vivid-000";
 const GRABBER: &str = "platform:vivid-001";
@@ -23,9 +22,9 @@ const DAMAGE: u32 = 0x00f0_f042;
 const REFUSE_STREAM: u32 = 0x00f0_f045;
 const BREAK_STREAM: u32 = 0x00f0_f046;
 /// Drift of the stamps relative to the sequence numbers, in periods, that may occur without a miscount. A miscount
-/// changes the drift by a whole period. vivid stamps images late: by 0 to 0.25 periods on an idle machine, and by up to
-/// 0.75 with twice as many busy processes as cores.
-const DRIFT_RANGE: std::ops::Range<f64> = -0.7..0.95;
+/// changes the drift by a whole period. vivid stamps images up to one tick of the kernel late, which is a quarter of a
+/// period.
+const DRIFT_RANGE: std::ops::RangeInclusive<f64> = -0.3..=0.3;
 /// V4L2 ids of gain and brightness, and values other than the defaults.
 const GAIN: u32 = 0x0098_0913;
 const BRIGHTNESS: u32 = 0x0098_0900;
@@ -83,8 +82,7 @@ impl CapturedImages {
     fn report(&self, what: &str, rate_hz: f64) -> (u64, u64) {
         let first = self.images[0].stamp;
         let mut number = 0;
-        // Delay of each image relative to its sequence number, in periods. A miscount shifts all later images by one; a
-        // busy machine only delays images.
+        // Delay of each image relative to its sequence number, in periods. A miscount shifts all later images by one.
         let delays: Vec<f64> = (self.images.iter().enumerate())
             .map(|(ix, image)| {
                 number += if ix == 0 { 0 } else { 1 + image.n_skipped };
@@ -118,7 +116,7 @@ fn every_lost_image_is_counted() {
         let captured = CapturedImages::capture(&mut camera, 10.0);
         let (delivered, n_lost) = captured.report(&what, rate_hz);
         let CameraCounts { n_images, n_skipped, n_reconnections } = camera.counts();
-        assert_eq!((n_images, camera.n_damaged(), n_reconnections), (delivered + 1, 0, 0));
+        assert_eq!((n_images, n_lost, camera.n_damaged(), n_reconnections), (delivered + 1, 0, 0, 0));
         assert_eq!(n_skipped, n_lost + captured.images[0].n_skipped);
         let first = &captured.images[0];
         assert_eq!(
@@ -141,30 +139,12 @@ fn injected_drops_are_counted_exactly() {
     assert!((0.19..0.41).contains(&share), "lost a fraction of {share:.2}");
 }
 
-/// When a camera had a fault, and when it delivered images again.
-struct Recovery {
-    what: &'static str,
-    began: Instant,
-    ended: Instant,
-}
-
-impl Recovery {
-    fn since(what: &'static str, began: Instant) -> Self {
-        Self { what, began, ended: Instant::now() }
-    }
-
-    fn duration(&self) -> Duration {
-        self.ended - self.began
-    }
-}
-
-/// Without the time in which the machine stalled.
-fn assert_fast(recoveries: &[Recovery], stalled: &StalledTimes) {
-    for Recovery { what, began, ended } in recoveries {
-        let unstalled = stalled.unstalled(*began, *ended);
-        println!("{what}: recovered after {:.0?}", *ended - *began);
-        assert!(unstalled < Duration::from_secs(1), "{what}: {unstalled:?}");
-    }
+/// Time since a fault, after which the camera delivers images again.
+fn time_to_recover(what: &str, faulted_at: Instant) -> Duration {
+    let duration = faulted_at.elapsed();
+    println!("{what}: recovered after {duration:.0?}");
+    assert!(duration < Duration::from_secs(1), "{what}: {duration:?}");
+    duration
 }
 
 /// Waits for an image after a fault.
@@ -204,7 +184,6 @@ fn unplugged_camera_reconnects_with_all_settings() {
     CapturedImages::capture(&mut camera, 0.5);
     assert_settings(&camera);
 
-    let (stalls, mut recoveries) = (Stalls::start(), Vec::new());
     for n_before in 0..3 {
         v4l2::set_control(&node(WEBCAM), DISCONNECT, 1).expect("vivid injects faults");
         // Images captured before may still arrive.
@@ -215,8 +194,7 @@ fn unplugged_camera_reconnects_with_all_settings() {
                 break image;
             }
         };
-        recoveries.push(Recovery::since("disconnected", start_time));
-        let max_lost = recoveries[recoveries.len() - 1].duration().as_secs_f64() * rate_hz + 1.0;
+        let max_lost = time_to_recover("disconnected", start_time).as_secs_f64() * rate_hz + 1.0;
         assert!(image.n_skipped as f64 <= max_lost, "{} images counted as lost, at most {max_lost}", image.n_skipped);
         assert_settings(&camera);
     }
@@ -226,20 +204,17 @@ fn unplugged_camera_reconnects_with_all_settings() {
     while !matches!(camera.next_image(Duration::from_millis(50)), Err(Error::Reconnecting { .. })) {
         assert!(unplugged_at.elapsed() < Duration::from_secs(30), "the driver did not detect the outage");
     }
-    let detected_at = Instant::now();
-    std::thread::sleep(Duration::from_secs(1).saturating_sub(unplugged_at.elapsed()));
+    let detected_after = unplugged_at.elapsed();
+    assert!(detected_after < Duration::from_secs(2), "{detected_after:?}");
+    std::thread::sleep(Duration::from_secs(1).saturating_sub(detected_after));
     write_driver_action("bind");
     let bound_at = Instant::now();
     let image = recovered_image(&mut camera, bound_at);
-    recoveries.push(Recovery::since("connected again", bound_at));
+    time_to_recover("connected again", bound_at);
     // At least one second without a camera, plus the time to bind it.
     let max_lost = unplugged_at.elapsed().as_secs_f64() * rate_hz + 10.0;
     let lost_range = 20.0..=max_lost;
     assert!(lost_range.contains(&(image.n_skipped as f64)), "{} images lost, expected {lost_range:?}", image.n_skipped);
-    let stalled = stalls.stop();
-    assert_fast(&recoveries, &stalled);
-    let unstalled = stalled.unstalled(unplugged_at, detected_at);
-    assert!(unstalled < Duration::from_secs(2), "the driver detected the outage only after {unstalled:?}");
     assert_settings(&camera);
     CapturedImages::capture(&mut camera, 2.0).report("after reconnecting", rate_hz);
 }
@@ -251,7 +226,6 @@ fn missing_camera_is_an_error_after_timeout() {
     let mut camera =
         V4l2Camera::open(Config { reconnect_for: wait, ..config(WEBCAM, [320, 180], 25.0) }).expect("vivid opens");
     CapturedImages::capture(&mut camera, 0.2);
-    let stalls = Stalls::start();
     write_driver_action("unbind");
     let start_time = Instant::now();
     let error = loop {
@@ -262,12 +236,11 @@ fn missing_camera_is_an_error_after_timeout() {
             Err(error) => break error.to_string(),
         }
     };
-    let given_up_at = Instant::now();
-    let unstalled = stalls.stop().unstalled(start_time, given_up_at);
+    let given_up_after = start_time.elapsed();
     write_driver_action("bind");
     println!("not reconnected: {error}");
     assert!(error.contains("\"front\"") && error.contains("did not reconnect within"), "{error}");
-    assert!(given_up_at - start_time >= wait && unstalled < 2 * wait, "{unstalled:?}");
+    assert!(given_up_after >= wait && given_up_after < 2 * wait, "{given_up_after:?}");
 }
 
 #[test]
@@ -325,14 +298,13 @@ fn damaged_images_and_broken_streams_are_counted_and_recovered() {
     }
     let (_, n_lost) = captured.report("three damaged images", rate_hz);
     assert_eq!(camera.n_damaged(), 3);
-    assert!(n_lost >= 3, "{n_lost}: a busy machine may lose more");
+    assert_eq!(n_lost, 3);
     assert_eq!(camera.counts().n_reconnections, 0, "a damaged image does not restart the stream");
 
-    let stalls = Stalls::start();
     v4l2::set_control(&node(WEBCAM), BREAK_STREAM, 1).expect("vivid injects faults");
     let broken_at = Instant::now();
     recovered_image(&mut camera, broken_at);
-    assert_fast(&[Recovery::since("failed stream", broken_at)], &stalls.stop());
+    time_to_recover("failed stream", broken_at);
     assert_eq!(camera.counts().n_reconnections, 1);
     drop(camera);
 
@@ -393,11 +365,9 @@ fn newest_image_is_delivered_if_configured() {
         let captured = CapturedImages { images, elapsed: Duration::default() };
         (captured.report(&format!("{delivery:?}, every 200 ms"), rate_hz), ages_secs)
     };
-    let ((_, n_lost), mut ages_secs) = deliver(Delivery::Newest);
+    let ((_, n_lost), ages_secs) = deliver(Delivery::Newest);
     assert!(n_lost >= 20, "{n_lost} images lost at five images per 200 ms");
-    // The median, because the machine may stall.
-    ages_secs.sort_by(f64::total_cmp);
-    assert!(ages_secs[4] < 0.15, "the newest images are {ages_secs:?} s old");
+    assert!(ages_secs.iter().all(|age_secs| *age_secs < 0.05), "the newest images are {ages_secs:?} s old");
     let (_, ages_secs) = deliver(Delivery::Every);
     assert!(ages_secs[7] > 0.2, "the oldest queued images are only {ages_secs:?} s old");
 }
@@ -455,12 +425,12 @@ fn program_lists_and_records_camera() {
     assert!(text.contains("cameras"), "{text}");
     let (code, text) =
         fieldrig(&["record", "/rigs/vivid.toml", "--out", "/tmp/vivid.mcap", "--seconds", "4", "--json"]);
-    assert!(code == Some(0) || code == Some(3), "recorded, possibly with losses: {code:?}");
+    assert_eq!(code, Some(0));
     let summary = text.lines().find(|line| line.contains("\"done\"")).expect("a summary");
     let summary: serde_json::Value = serde_json::from_str(summary).expect("JSON");
     let number = |key: &str| summary[key].as_u64().expect("a number");
     let (images, n_lost) = (number("images"), number("images_dropped_by_devices"));
-    assert!((98..=103).contains(&(images + n_lost)), "{images} images and {n_lost} lost in 4 s at 25 Hz");
+    assert!((98..=103).contains(&images) && n_lost == 0, "{images} images and {n_lost} lost in 4 s at 25 Hz");
     let node = node(WEBCAM);
     assert_eq!((v4l2::control(&node, GAIN).ok(), v4l2::control(&node, BRIGHTNESS).ok()), (Some(77), Some(99)));
     let mut recording = drivers::recording::Recording::open(Path::new("/tmp/vivid.mcap")).expect("a recording");

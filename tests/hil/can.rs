@@ -222,19 +222,12 @@ fn joints_are_read_from_motors_of_all_families() {
     // Half a count of velocity, times a few milliseconds of extrapolation.
     const EXTRAPOLATED_RAD: f64 = 1e-4;
     let half_counts = [12.5 / 65_535.0, 12.5 / 65_535.0, 12.57 / 65_535.0, 1e-6, 4.8e-5, 12.5 / 65_535.0];
-    // On a busy machine, individual states are extrapolated over a longer time.
-    const MAX_EXTRAPOLATED_RAD: f64 = 2e-3;
-    let mut min_error = [f64::INFINITY; 6];
     for _ in 0..100 {
         let state = arm.read(Duration::from_secs(1)).expect("the motors report");
         for (ix, half_count) in half_counts.iter().enumerate() {
             let error_rad = (state.position[ix] - rest_rad(ix)).abs();
-            min_error[ix] = min_error[ix].min(error_rad);
-            assert!(error_rad < half_count + MAX_EXTRAPOLATED_RAD, "{}: error {error_rad} rad", motors[ix].joint);
+            assert!(error_rad < half_count + EXTRAPOLATED_RAD, "{}: error {error_rad} rad", motors[ix].joint);
         }
-    }
-    for (ix, error_rad) in min_error.iter().enumerate() {
-        assert!(*error_rad < half_counts[ix] + EXTRAPOLATED_RAD, "{}: minimum error {error_rad} rad", motors[ix].joint);
     }
     bench.is_swinging.store(true, Ordering::Relaxed);
     let mut max_error = vec![0.0_f64; motors.len()];
@@ -256,8 +249,7 @@ fn joints_are_read_from_motors_of_all_families() {
         median(&read_delays).unwrap_or(f64::NAN)
     );
     assert!(read_delays.len() > 100, "ODrive and Robstride report 100 times per second");
-    // On a busy machine without a real-time kernel, processes may be delayed by tens of milliseconds.
-    assert!(max_error.iter().all(|max_error| *max_error < 0.1 * SWING_RAD * SWING_RAD_S), "{max_error:?}");
+    assert!(max_error.iter().all(|max_error| *max_error < 1e-3), "{max_error:?}");
 }
 
 #[test]
@@ -332,13 +324,11 @@ fn silent_motor_and_bus_down_are_errors() {
     assert!(matches!(error, Error::CanBus { .. }), "{error}");
 }
 
-/// Runs the production binary. Returns whether it succeeded, and its output.
+/// Runs the production binary. Returns whether it succeeded without losses, and its output.
 fn fieldrig(arguments: &[&str]) -> (bool, String) {
     let output = Command::new("/bin/fieldrig").args(arguments).output().expect("fieldrig is installed");
     let printed = [output.stdout, output.stderr].concat();
-    // Exit code 3 means success with losses: a busy machine drops images, which are counted.
-    let is_done = matches!(output.status.code(), Some(0 | 3));
-    (is_done, String::from_utf8_lossy(&printed).into_owned())
+    (output.status.code() == Some(0), String::from_utf8_lossy(&printed).into_owned())
 }
 
 #[test]
@@ -363,7 +353,6 @@ fn binary_records_camera_and_can_arm() {
         let (_, rest) = summary.split_once(&format!("\"{key}\":")).expect(key);
         rest.split([',', '}']).next().and_then(|number| number.parse().ok()).expect("a number")
     };
-    assert!(n("images") + n("images_dropped_by_devices") > 65.0 && n("images") > 15.0, "{summary}");
-    // Two motors at 200 Hz, minus losses on a busy machine without a real-time kernel.
-    assert!(n("joint_states") > 200.0, "{summary}");
+    assert!((73.0..=76.0).contains(&n("images")) && n("images_dropped_by_devices") == 0.0, "{summary}");
+    assert!((590.0..=610.0).contains(&n("joint_states")), "{summary}");
 }

@@ -6,10 +6,9 @@ use drivers::v4l2::{self, Delivery, V4l2Camera, V4l2Format};
 use drivers::{Camera, Error, Image, PixelFormat};
 use kinematics::{Intrinsics, Lens};
 use std::time::{Duration, Instant};
-use test_support::Stalls;
 
 const RATE_HZ: f64 = 25.0;
-/// Limit for the detection of an outage and for recovery, without the time in which the machine stalled.
+/// Limit for the detection of an outage and for recovery.
 const MAX_REACTION: Duration = Duration::from_secs(2);
 
 fn config() -> Config {
@@ -96,11 +95,9 @@ fn hanging_nokhwa_call_is_abandoned() {
     camera.next_image(Duration::from_secs(2)).expect("vivid streams");
     // vivid stops sending images, and the call of nokhwa never returns.
     v4l2::set_control(&node(WEBCAM), DROP_PERCENT, 100).expect("vivid injects faults");
-    let (stalls, dropped_at) = (Stalls::start(), Instant::now());
     let detected_after = time_to_disconnect(&mut camera);
     println!("nokhwa: a hanging call was abandoned after {detected_after:.2?}");
-    let unstalled = stalls.stop().unstalled(dropped_at, dropped_at + detected_after);
-    assert!(unstalled < MAX_REACTION, "{unstalled:?}");
+    assert!(detected_after < MAX_REACTION, "{detected_after:?}");
     assert_eq!(camera.n_abandoned(), 1);
     write_driver_action("unbind");
     let unplugged_at = Instant::now();
@@ -108,10 +105,8 @@ fn hanging_nokhwa_call_is_abandoned() {
         assert!(matches!(camera.next_image(Duration::from_millis(50)), Err(Error::Reconnecting { .. })));
     }
     write_driver_action("bind");
-    let (stalls, bound_at) = (Stalls::start(), Instant::now());
     let (image, elapsed) = time_to_recover(&mut camera);
-    let unstalled = stalls.stop().unstalled(bound_at, bound_at + elapsed);
-    assert!(unstalled < MAX_REACTION, "{unstalled:?}");
+    assert!(elapsed < MAX_REACTION, "{elapsed:?}");
     println!(
         "nokhwa: reconnected, recovered after {elapsed:.2?}; about {} images were lost; {:?}",
         image.n_skipped,
@@ -129,17 +124,15 @@ fn nokhwa_camera_survives_unplugging() {
     let mut camera = open(config());
     camera.next_image(Duration::from_secs(2)).expect("vivid streams");
     write_driver_action("unbind");
-    let (stalls, unplugged_at) = (Stalls::start(), Instant::now());
+    let unplugged_at = Instant::now();
     let detected_after = time_to_disconnect(&mut camera);
     std::thread::sleep(Duration::from_secs(1).saturating_sub(detected_after));
     write_driver_action("bind");
-    let bound_at = Instant::now();
     let (image, elapsed) = time_to_recover(&mut camera);
-    let stalled = stalls.stop();
-    for (what, began, took) in [("detected", unplugged_at, detected_after), ("recovered", bound_at, elapsed)] {
-        let unstalled = stalled.unstalled(began, began + took);
-        assert!(unstalled < MAX_REACTION, "{what} after {unstalled:?}");
-    }
+    assert!(
+        detected_after.max(elapsed) < MAX_REACTION,
+        "detected after {detected_after:?}, recovered after {elapsed:?}"
+    );
     println!(
         "nokhwa: disconnected, detected after {detected_after:.2?}, recovered after {elapsed:.2?}, about {} images lost",
         image.n_skipped

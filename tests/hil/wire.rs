@@ -44,8 +44,7 @@ fn mobile_arm_is_read_and_moved_through_drivers() {
         (output.status.code(), printed)
     };
     let (code, printed) = fieldrig(&["record", "/tmp/mobile/rig.toml", "--out", "/tmp/mobile.mcap", "--json"]);
-    // A busy machine drops images, which are counted.
-    assert!(matches!(code, Some(0 | 3)), "{printed}");
+    assert_eq!(code, Some(0), "{printed}");
     let difference = compare::difference(&script, Path::new("/tmp/mobile.mcap"));
     println!("wire: {difference:?}");
     assert!(difference.n_images >= 20, "{difference:?}");
