@@ -1,18 +1,26 @@
 //! Signals that end a command: it stops, saves, and exits.
 //!
 //! SIGINT (Ctrl-C), SIGTERM and SIGHUP (the terminal was closed) request an orderly stop. A second Ctrl-C ends the
-//! process at once. SIGHUP never does, because closing a terminal sends it more than once: from the kernel to the
-//! foreground group, and from the shell to its jobs. If SIGHUP is ignored, as under `nohup`, it stays ignored.
+//! process at once; arms with CAN motors get their fail-safe command before that. SIGHUP never does, because closing a
+//! terminal sends it more than once: from the kernel to the foreground group, and from the shell to its jobs. If SIGHUP
+//! is ignored, as under `nohup`, it stays ignored.
 
 use anyhow::Context;
 use capture::Stop;
+use rustix::event::{PollFd, PollFlags, poll};
+use rustix::io::Errno;
 use session::partial;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
-use signal_hook::flag;
 use signal_hook::iterator::Signals;
+use signal_hook::low_level;
+use std::os::fd::AsFd;
+use std::sync::atomic::Ordering;
+use std::time::{Duration, Instant};
 
 /// Shells report this plus the signal number as the exit code of a process that a signal ended.
 const SIGNAL_EXIT_BASE: i32 = 128;
+/// A second Ctrl-C within this time counts as the same one: some programs signal both a process and its group.
+const MIN_BETWEEN: Duration = Duration::from_millis(500);
 
 /// Handles SIGINT, SIGTERM and SIGHUP of a command that saves its results; at most once per process.
 pub(crate) fn stop_on_signals() -> anyhow::Result<Stop> {
@@ -22,14 +30,40 @@ pub(crate) fn stop_on_signals() -> anyhow::Result<Stop> {
 /// As [`stop_on_signals`], for a command that saves nothing.
 pub(crate) fn stop_on_signals_logging(message: &'static str) -> anyhow::Result<Stop> {
     let (stop, [signaled, interrupted]) = Stop::with_signal_flags(message);
-    let register = || -> std::io::Result<()> {
-        // Actions run in the order of registration, so the first Ctrl-C only sets the flags.
-        flag::register_conditional_shutdown(SIGINT, SIGNAL_EXIT_BASE + SIGINT, interrupted.clone())?;
-        flag::register(SIGINT, interrupted)?;
-        termination_signals().try_for_each(|signal| flag::register(signal, signaled.clone()).map(drop))
+    let mut signals = Signals::new(termination_signals()).context("cannot install signal handlers")?;
+    let mut interrupted_at = Instant::now();
+    let take_signals = move || {
+        for signal in signals.forever() {
+            if signal == SIGINT {
+                if !interrupted.swap(true, Ordering::Relaxed) {
+                    interrupted_at = Instant::now();
+                } else if interrupted_at.elapsed() >= MIN_BETWEEN {
+                    drivers::motion::apply_fail_safe();
+                    low_level::exit(SIGNAL_EXIT_BASE + SIGINT);
+                }
+            }
+            signaled.store(true, Ordering::Relaxed);
+        }
     };
-    register().context("cannot install signal handlers")?;
+    std::thread::Builder::new().name("signals".into()).spawn(take_signals).context("cannot start a thread")?;
     Ok(stop)
+}
+
+/// Requests a stop when stdout or stderr is closed, because nobody supervises the command any more: a terminal without
+/// SIGHUP, or the reader of a pipe. At most once per process.
+pub(crate) fn stop_when_output_closes(stop: &Stop) -> anyhow::Result<()> {
+    let stop = stop.clone();
+    let watch = move || {
+        let (stdout, stderr) = (std::io::stdout(), std::io::stderr());
+        // Errors and hang-ups are reported without being requested.
+        let mut outputs =
+            [stdout.as_fd(), stderr.as_fd()].map(|output| PollFd::from_borrowed_fd(output, PollFlags::empty()));
+        while poll(&mut outputs, None) == Err(Errno::INTR) {}
+        log::warn!("the output was closed: stopping");
+        stop.request();
+    };
+    std::thread::Builder::new().name("output".into()).spawn(watch).context("cannot start a thread")?;
+    Ok(())
 }
 
 /// Removes partial files before a signal ends the process.

@@ -67,7 +67,8 @@ struct ArrivedEvent<'a> {
 
 /// Moves the arm, then holds it if its motors would release it on exit.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
-    let stop = signals::stop_on_signals()?;
+    let stop = signals::stop_on_signals_logging("stopping the arm; Ctrl-C again ends the program at once")?;
+    signals::stop_when_output_closes(&stop)?;
     let rig = Rig::load(&args.rig_file, &[])?;
     let motion = motion_of(&rig)?;
     check(args, &rig)?;

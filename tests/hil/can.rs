@@ -140,6 +140,7 @@ pub(crate) fn motor(joint: &str, protocol: impl MotorProtocol + 'static) -> Moto
         is_reversed: false,
         offset_rad: 0.0,
         gains: None,
+        following: drivers::can::FollowingLimits::default(),
     }
 }
 

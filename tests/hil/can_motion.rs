@@ -39,11 +39,13 @@ const UNITS: Units = Units { counts_per_turn: 65_536.0, rated_torque_nm: 10.0 };
 #[derive(Clone, Debug)]
 pub(crate) struct MotorObservation {
     pub(crate) state: State,
-    position_rad: f64,
-    velocity_rad_s: f64,
+    pub(crate) position_rad: f64,
+    pub(crate) velocity_rad_s: f64,
     timed_out_at: Option<Stamp>,
     /// Commanded positions, in order.
     commanded_rad: Vec<f64>,
+    /// Stiffness and damping of the last command in MIT mode, at the motor.
+    pub(crate) gains: [f64; 2],
 }
 
 /// Motors on a separate thread, on a cable that can be disconnected.
@@ -51,6 +53,8 @@ pub(crate) struct Motors {
     observed: Arc<Mutex<Vec<MotorObservation>>>,
     is_disconnected: Arc<AtomicBool>,
     fails_next: Arc<AtomicBool>,
+    /// Whether an obstacle holds all shafts where they are.
+    pub(crate) is_blocked: Arc<AtomicBool>,
     stop: Arc<AtomicBool>,
     thread: Option<JoinHandle<()>>,
 }
@@ -58,10 +62,11 @@ pub(crate) struct Motors {
 impl Motors {
     pub(crate) fn new(bus: BusConfig, configs: Vec<MotorConfig>, ignore_timeout: bool) -> Self {
         let flag = || Arc::new(AtomicBool::new(false));
-        let (is_disconnected, fails_next, stop) = (flag(), flag(), flag());
+        let (is_disconnected, fails_next, is_blocked, stop) = (flag(), flag(), flag(), flag());
         let observed = Arc::<Mutex<Vec<MotorObservation>>>::default();
         let (disconnected, fail_flag, stop_flag, observed_by_thread) =
             (Arc::clone(&is_disconnected), Arc::clone(&fails_next), Arc::clone(&stop), Arc::clone(&observed));
+        let blocked_flag = Arc::clone(&is_blocked);
         let bus = Bus::open(&bus).expect("the bus is up");
         let thread = std::thread::spawn(move || {
             let mut emulated: Vec<_> =
@@ -70,11 +75,20 @@ impl Motors {
             if ignore_timeout {
                 emulated.iter_mut().for_each(EmulatedMotor::ignore_timeout);
             }
+            let mut was_blocked = false;
             while !stop_flag.load(Ordering::Relaxed) {
                 // Errors are ignored: a link that goes down reports one.
                 let arrived = bus.receive(MOTOR_PERIOD).unwrap_or(None);
                 let now = clock::now();
                 let mut sent = Vec::new();
+                let is_blocked = blocked_flag.load(Ordering::Relaxed);
+                if is_blocked != was_blocked {
+                    for motor in &mut emulated {
+                        let stops = [f64::NEG_INFINITY, f64::INFINITY];
+                        motor.set_stops(if is_blocked { [motor.motion().position_rad; 2] } else { stops });
+                    }
+                    was_blocked = is_blocked;
+                }
                 if fail_flag.swap(false, Ordering::Relaxed) {
                     emulated[0].fail();
                 }
@@ -105,16 +119,17 @@ impl Motors {
                         velocity_rad_s: motor.motion().velocity_rad_s,
                         timed_out_at: motor.timed_out_at(),
                         commanded_rad: commanded_rad.clone(),
+                        gains: motor.target().map_or([0.0; 2], |target| [target.kp_nm_rad, target.kd_nm_s_rad]),
                     })
                     .collect();
             }
         });
-        let motors = Self { observed, is_disconnected, fails_next, stop, thread: Some(thread) };
+        let motors = Self { observed, is_disconnected, fails_next, is_blocked, stop, thread: Some(thread) };
         motors.wait_until("the motors run", |observed| !observed.is_empty());
         motors
     }
 
-    fn observed(&self) -> MutexGuard<'_, Vec<MotorObservation>> {
+    pub(crate) fn observed(&self) -> MutexGuard<'_, Vec<MotorObservation>> {
         self.observed.lock()
     }
 
@@ -188,7 +203,7 @@ pub(crate) fn movable(bus: BusConfig, motors: &[MotorConfig], on_loss: OnLoss) -
 }
 
 /// Whether this is an AK motor, which has no watchdog.
-fn is_ak(motor: &MotorConfig) -> bool {
+pub(crate) fn is_ak(motor: &MotorConfig) -> bool {
     motor.protocol.family().name() == "tmotor"
 }
 
@@ -198,7 +213,7 @@ fn drive(number: u8) -> MotorConfig {
 }
 
 /// One motor of each family that has a watchdog.
-fn motors_with_watchdog() -> Vec<MotorConfig> {
+pub(crate) fn motors_with_watchdog() -> Vec<MotorConfig> {
     vec![
         damiao(1),
         motor("robstride", Robstride { motor: 3, model: robstride::Model::Rs02 }),
@@ -582,7 +597,7 @@ fn start_child(arguments: &str) -> Child {
         .expect("the test program is installed")
 }
 
-fn signal(child: &Child, signal: &str) {
+pub(crate) fn signal(child: &Child, signal: &str) {
     let status = Command::new("/bin/busybox").args(["kill", signal, &child.id().to_string()]).status();
     assert!(status.expect("busybox has kill").success());
 }

@@ -14,6 +14,7 @@ mod arm_capture;
 mod cameras;
 mod can;
 mod can_motion;
+mod guards;
 mod kvaser;
 #[cfg(feature = "nokhwa")]
 mod nokhwa;
@@ -44,8 +45,8 @@ $bb mount -t tmpfs tmp /tmp
 $bb ip link set lo up
 $bb ip link add dev vcan0 type vcan
 $bb ip link set vcan0 up
-export LD_LIBRARY_PATH=/lib
-/bin/hil --ignored --test-threads=1 --nocapture --skip kvaser::
+export LD_LIBRARY_PATH=/lib TRIALS
+/bin/hil --ignored --test-threads=1 --nocapture --skip kvaser:: FILTER
 echo "hil: exit $?"
 $bb poweroff -f
 "#;
@@ -75,7 +76,12 @@ fn cameras_and_buses_in_virtual_kernel() {
         let folder = root_folder();
         let kernel = kernel("build-kernel.sh");
         let root = folder.join("root");
-        install_root(&root, INIT, &[]);
+        let variable = |name, default: &str| std::env::var(name).unwrap_or_else(|_| default.to_owned());
+        let trials = format!("FIELDRIG_TRIALS={}", variable("FIELDRIG_TRIALS", "3"));
+        let init = INIT.replace("TRIALS", &trials);
+        // FILTER is empty or the name of a test inside.
+        let init = init.replace("FILTER", &variable("FIELDRIG_HIL_FILTER", ""));
+        install_root(&root, &init, &[]);
         #[cfg(all(feature = "realsense", feature = "sim"))]
         wire::install_root(&root);
         boot(&kernel, &root, &folder)

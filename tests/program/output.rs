@@ -21,8 +21,8 @@ const TIMEOUT: Duration = Duration::from_secs(240);
 const LOSS: i32 = 3;
 
 /// A program on a pseudoterminal that can be closed.
-struct OnTerminal {
-    child: Child,
+pub(crate) struct OnTerminal {
+    pub(crate) child: Child,
     terminal: File,
     printed: Vec<u8>,
 }
@@ -30,7 +30,7 @@ struct OnTerminal {
 impl OnTerminal {
     /// Starts `fieldrig`. With `controlled`, the terminal is its controlling terminal, as in a shell, and closing it
     /// sends SIGHUP.
-    fn start(folder: &Path, args: &[&str], controlled: bool) -> Self {
+    pub(crate) fn start(folder: &Path, args: &[&str], controlled: bool) -> Self {
         let master = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC).unwrap();
         grantpt(&master).unwrap();
         unlockpt(&master).unwrap();
@@ -46,7 +46,7 @@ impl OnTerminal {
     }
 
     /// Reads until the program has printed this text.
-    fn wait_for(&mut self, text: &str) {
+    pub(crate) fn wait_for(&mut self, text: &str) {
         let mut bytes = [0; 4096];
         while !self.printed.windows(text.len()).any(|window| window == text.as_bytes()) {
             let n = self.terminal.read(&mut bytes).unwrap_or(0);
@@ -56,7 +56,7 @@ impl OnTerminal {
     }
 
     /// Closes the terminal; returns the program's exit status.
-    fn close(self) -> ExitStatus {
+    pub(crate) fn close(self) -> ExitStatus {
         drop(self.terminal);
         wait_for_exit(self.child)
     }

@@ -3,8 +3,8 @@
 use super::key::{Key, Keys, entry, keys};
 use super::section::Section;
 use drivers::can::{
-    AllowedValues, BusConfig, FAMILIES, Gains, MotorConfig, MotorFamily, MotorKey, MotorProtocol, MotorSettings,
-    SettingValue,
+    AllowedValues, BusConfig, FAMILIES, FollowingLimits, Gains, MotorConfig, MotorFamily, MotorKey, MotorProtocol,
+    MotorSettings, SettingValue,
 };
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -30,6 +30,9 @@ keys! {
         gear_ratio: f64 = 1.0, in 0.001..=10_000.0;
         reversed: bool = false;
         offset_rad: f64 = 0.0, in -100.0..=100.0;
+        max_following_error_rad: f64 = FollowingLimits::default().max_error_rad, in 0.001..=10.0;
+        max_effort_nm: Option<f64>, in 0.01..=1e6;
+        accept_following_errors: bool = false;
     }
 
     /// The gains of motors whose commands include them. Either both keys or none must be set.
@@ -90,7 +93,12 @@ fn motor(joint: String, mut keys: Section<'_>, buses: &[BusConfig]) -> Option<Mo
         keys.end();
         return None;
     };
-    let MotorKeys { family, bus, id, gear_ratio, reversed: is_reversed, offset_rad } = motor;
+    let MotorKeys { family, bus, id, gear_ratio, reversed: is_reversed, offset_rad, .. } = motor;
+    let following = FollowingLimits {
+        max_error_rad: motor.max_following_error_rad,
+        max_effort_nm: motor.max_effort_nm,
+        is_off: motor.accept_following_errors,
+    };
     let bus_ix = buses.iter().position(|known| known.interface == bus).or_else(|| {
         let interfaces = quoted(buses.iter().map(|bus| &*bus.interface));
         let allowed = if interfaces.is_empty() { "the name of a table [arm.bus.NAME]".to_owned() } else { interfaces };
@@ -99,7 +107,8 @@ fn motor(joint: String, mut keys: Section<'_>, buses: &[BusConfig]) -> Option<Mo
     let gains = if family.has_gains() { gains(&mut keys) } else { None };
     let protocol = protocol(&mut keys, family, id);
     keys.end();
-    Some(MotorConfig { joint, bus_ix: bus_ix?, protocol: protocol?, gear_ratio, is_reversed, offset_rad, gains })
+    let (bus_ix, protocol) = (bus_ix?, protocol?);
+    Some(MotorConfig { joint, bus_ix, protocol, gear_ratio, is_reversed, offset_rad, gains, following })
 }
 
 /// Reads the keys of the family. Reports a required key that is missing or invalid, and returns `None`.
@@ -160,13 +169,24 @@ pub(super) fn write(buses: &[BusConfig], motors: &[MotorConfig]) -> Table {
 }
 
 fn write_motor(motor: &MotorConfig, bus: &str) -> Table {
-    let MotorConfig { gear_ratio, is_reversed: reversed, offset_rad, gains, .. } = *motor;
+    let MotorConfig { gear_ratio, is_reversed: reversed, offset_rad, gains, following, .. } = *motor;
     let (family, MotorSettings { id, values }) = (motor.protocol.family(), motor.protocol.settings());
     let gains = GainKeys {
         stiffness_nm_rad: gains.map(|gains| gains.stiffness_nm_rad),
         damping_nm_s_rad: gains.map(|gains| gains.damping_nm_s_rad),
     };
-    let mut table = MotorKeys { family, bus: bus.to_owned(), id, gear_ratio, reversed, offset_rad }.write_keys();
+    let keys = MotorKeys {
+        family,
+        bus: bus.to_owned(),
+        id,
+        gear_ratio,
+        reversed,
+        offset_rad,
+        max_following_error_rad: following.max_error_rad,
+        max_effort_nm: following.max_effort_nm,
+        accept_following_errors: following.is_off,
+    };
+    let mut table = keys.write_keys();
     table.extend(values.into_iter().filter_map(|(name, value)| Some((name.to_owned(), write_setting(value)?))));
     table.extend(gains.write_keys());
     table

@@ -83,7 +83,7 @@ fn with(key: &'static str, value: &str) -> Result<Rig, ConfigError> {
 }
 
 /// Key, a valid value that differs from the current one, and an invalid value.
-const KEYS: [(&str, &str, &str); 183] = [
+const KEYS: [(&str, &str, &str); 186] = [
     ("arm.rate_hz", "500", "0"),
     ("arm.bus.can0.bitrate_hz", "500_000", "1"),
     ("arm.bus.can0.data_bitrate_hz", "5_000_000", "9_000_000"),
@@ -102,6 +102,9 @@ const KEYS: [(&str, &str, &str); 183] = [
     ("arm.motor.third.offset_rad", "-0.5", "'left'"),
     ("arm.motor.first.stiffness_nm_rad", "60.5", "-1"),
     ("arm.motor.first.damping_nm_s_rad", "0", "'much'"),
+    ("arm.motor.first.max_following_error_rad", "0.05", "0"),
+    ("arm.motor.first.max_effort_nm", "12.5", "-1"),
+    ("arm.motor.first.accept_following_errors", "true", "1"),
     ("arm.motion.on_loss", "'hold'", "'panic'"),
     ("arm.motion.timeout_millis", "50", "0"),
     ("arm.motion.acceleration_secs", "1", "0"),

@@ -18,7 +18,7 @@ mod tests;
 mod waiting;
 
 pub use change::Change;
-pub(crate) use motion::{CameraPose, Motion};
+pub(crate) use motion::{CameraPose, JointsRejection, Motion};
 pub use rejection::{Counts, Rejection, SampleUse};
 
 use crate::config::{self, BaseDriver, CameraDriver, Parent, Rig};
@@ -186,8 +186,16 @@ impl Join {
                     log::warn!("{joint_limit_warning}");
                     self.warned_joint_limits = true;
                 }
-                let is_valid = self.motion.push_joints(state);
-                self.counts.joints_rejected += u64::from(!is_valid);
+                match self.motion.push_joints(state) {
+                    Ok(()) => {}
+                    Err(JointsRejection::Invalid) => self.counts.joints_rejected += 1,
+                    Err(JointsRejection::TooFast(jump)) => {
+                        if self.counts.joints_too_fast == 0 {
+                            log::warn!("joint states are ignored: {jump}; does another program send them, too?");
+                        }
+                        self.counts.joints_too_fast += 1;
+                    }
+                }
             }
             Sample::Base(pose) => {
                 let is_valid = self.motion.push_base(&pose);

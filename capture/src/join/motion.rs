@@ -15,6 +15,11 @@ const MAX_READINGS: usize = 20_000;
 /// Tolerance for joint positions beyond the limits, radians or meters. Calibration errors and soft stops stay within
 /// it.
 const MAX_LIMIT_EXCESS: f64 = 0.2;
+/// Readings that differ by more than this multiple of the joint's speed limit are not from this arm. An arm that is
+/// pushed, or whose description has a limit for slow operation, stays below.
+const MAX_SPEED_FACTOR: f64 = 3.0;
+/// Added to the time between two readings, because their stamps may be inaccurate.
+const MAX_STAMP_ERROR_SECS: f64 = 0.02;
 /// Maximum gap for interpolating base poses from tags, in image periods. It lets one image in between lack a pose.
 const MAX_IMAGE_INTERVALS: f64 = 2.5;
 
@@ -27,6 +32,15 @@ pub(crate) struct Motion {
     offsets: Vec<f64>,
     joints: JointHistory,
     base: BaseMotion,
+}
+
+/// Why a joint reading was ignored.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) enum JointsRejection {
+    /// It is out of order or not finite, or has the wrong number of joints.
+    Invalid,
+    /// A joint would have moved much faster than it can; the description says which.
+    TooFast(String),
 }
 
 /// The pose of the base.
@@ -98,8 +112,11 @@ impl Motion {
         })
     }
 
-    /// Adds joint readings in the order of the device; returns whether they were valid.
-    pub(crate) fn push_joints(&mut self, state: JointState) -> bool {
+    /// Adds joint readings in the order of the device.
+    ///
+    /// # Errors
+    /// If they are not valid, or cannot follow the previous ones. They are then ignored.
+    pub(crate) fn push_joints(&mut self, state: JointState) -> Result<(), JointsRejection> {
         let ordered = |numbers: &[f64]| -> Option<Vec<f64>> {
             if numbers.is_empty() {
                 return Some(Vec::new());
@@ -111,9 +128,32 @@ impl Motion {
                 let position = position.iter().zip(&self.offsets).map(|(reading, offset)| reading + offset).collect();
                 JointState { stamp: state.stamp, position, velocity, effort: Vec::new() }
             }
-            _ => return false,
+            _ => return Err(JointsRejection::Invalid),
         };
-        self.joints.push(state).is_ok()
+        if let Some(jump) = self.jump(&state) {
+            return Err(JointsRejection::TooFast(jump));
+        }
+        self.joints.push(state).map_err(|_| JointsRejection::Invalid)
+    }
+
+    /// Describes the first joint that cannot have moved to this position since the previous reading.
+    fn jump(&self, state: &JointState) -> Option<String> {
+        let before = self.joints.newest().and_then(|newest| self.joints.at(newest).ok())?;
+        let secs = state.stamp.secs_since(before.stamp);
+        if secs <= 0.0 {
+            return None; // It is out of order.
+        }
+        let joints = self.chain.joint_names().iter().zip(self.chain.limits());
+        let mut joints = joints.zip(before.position.iter().zip(&state.position));
+        let ((name, limits), (from, to)) = joints.find(|((_, limits), (from, to))| {
+            let max_speed = MAX_SPEED_FACTOR * limits.velocity;
+            max_speed > 0.0 && (*to - *from).abs() > max_speed * (secs + MAX_STAMP_ERROR_SECS)
+        })?;
+        Some(format!(
+            "joint {name:?} jumps from {from:.3} to {to:.3} within {:.0} ms, but its speed limit is {:.2} per second",
+            1e3 * secs,
+            limits.velocity
+        ))
     }
 
     /// Adds a pose of a moving base; returns whether it was valid.

@@ -84,6 +84,8 @@ pub struct Counts {
     pub device_skipped: u64,
     /// Joint readings that were out of order or not finite, or had the wrong number of joints.
     pub joints_rejected: u64,
+    /// Joint readings that differ from the previous ones by more than the joints can move.
+    pub joints_too_fast: u64,
     /// Base poses that were out of order or not finite.
     pub base_poses_rejected: u64,
     /// Range scans transformed to the world frame.
@@ -114,6 +116,10 @@ impl Counts {
         if sample_use == SampleUse::Recorded && self.device_skipped > 0 {
             data_losses.push(dropped_by_devices(self.device_skipped));
         }
+        if self.joints_too_fast > 0 {
+            let what = counted(self.joints_too_fast, "joint state");
+            data_losses.push(format!("{what} ignored, because the joints cannot move so fast"));
+        }
         if let Some(n_undecodable) = self.rejected.get(&Rejection::Undecodable) {
             data_losses.push(format!("{} did not decode", counted(*n_undecodable, "image")));
         }
@@ -142,6 +148,7 @@ impl std::fmt::Display for Counts {
             (self.without_depth, "without depth"),
             (self.device_skipped, "dropped by devices"),
             (self.joints_rejected, "joint states rejected"),
+            (self.joints_too_fast, "joint states that jump"),
             (self.base_poses_rejected, "base poses rejected"),
             (self.range_scans, "range scans transformed"),
             (self.range_scans_rejected, "range scans rejected"),

@@ -1,6 +1,6 @@
 //! Generated samples in, keyframes out: poses at the shutter time, every rejection, the bounds, and bit-exact replay.
 
-use super::{Join, JoinEvent, Rejection};
+use super::{Join, JoinEvent, Rejection, SampleUse};
 use crate::config::{Override, Rig};
 use crate::open;
 use drivers::{BasePose, Image, PixelFormat, Sample, TruthImage};
@@ -335,6 +335,30 @@ fn non_finite_readings_reject_nearby_images() {
         effort: vec![],
     }));
     assert_eq!(short.counts().joints_rejected, 1);
+}
+
+/// Another program sends joint states of another arm to the same address, in between.
+#[test]
+fn joint_states_that_jump_are_ignored_and_counted_as_loss() {
+    let rig = rig(&[]);
+    let disturbed = samples(4).into_iter().flat_map(|sample| {
+        let foreign = match &sample {
+            Sample::Joints(state) if state.stamp.0 > 1_000_000_000 => {
+                let position = state.position.iter().map(|position| position + 1.0).collect();
+                Some(Sample::Joints(JointState { stamp: Stamp(state.stamp.0 + 1_000_000), position, ..state.clone() }))
+            }
+            _ => None,
+        };
+        std::iter::once(sample).chain(foreign)
+    });
+    let (mut undisturbed_join, mut join) = (join(&rig), join(&rig));
+    let undisturbed = run_join(&mut undisturbed_join, samples(4));
+    let outcome = run_join(&mut join, disturbed);
+    assert_eq!(differences(&undisturbed.keyframes, &outcome.keyframes), Vec::<String>::new());
+    assert_eq!((join.counts().joints_too_fast, join.counts().joints_rejected), (599, 0));
+    let losses = join.counts().data_losses(SampleUse::ProcessedOnly);
+    assert!(losses[0].contains("599 joint states ignored"), "{losses:?}");
+    assert_eq!(undisturbed_join.counts().joints_too_fast, 0);
 }
 
 #[test]

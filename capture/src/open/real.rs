@@ -127,7 +127,19 @@ fn movable_config(rig: &Rig, motion: &ArmMotion) -> crate::Result<MovableArmConf
         "" => None,
         _ => Some(endpoints().with_context(|| format!("arm.motion.odrive_endpoints {path:?}"))?),
     };
-    Ok(MovableArmConfig { arm: can_config(rig), motion: motion_config(rig, motion)?, odrive_endpoints })
+    let mut arm = can_config(rig);
+    limit_efforts(&mut arm, &super::chain_of(rig)?);
+    Ok(MovableArmConfig { arm, motion: motion_config(rig, motion)?, odrive_endpoints })
+}
+
+/// Limits the efforts that the rig file does not limit to those of the robot description, where 0 means unknown.
+#[cfg(target_os = "linux")]
+fn limit_efforts(arm: &mut can::ArmConfig, chain: &kinematics::Chain) {
+    for motor in &mut arm.motors {
+        let joint_ix = chain.joint_names().iter().position(|joint| *joint == motor.joint);
+        let effort = joint_ix.map(|joint_ix| chain.limits()[joint_ix].effort).filter(|effort| *effort > 0.0);
+        motor.following.max_effort_nm = motor.following.max_effort_nm.or(effort);
+    }
 }
 
 #[cfg(not(target_os = "linux"))]

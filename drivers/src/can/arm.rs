@@ -231,7 +231,7 @@ impl BusReader {
 
 #[cfg(test)]
 mod tests {
-    use super::super::config::MotorConfig;
+    use super::super::config::{FollowingLimits, MotorConfig};
     use super::super::damiao::Damiao;
     use super::*;
 
@@ -255,6 +255,7 @@ mod tests {
                     is_reversed: false,
                     offset_rad: 0.0,
                     gains: None,
+                    following: FollowingLimits::default(),
                 };
                 (usize::from(ix), Motor::with_limits(config, crate::wire::can::mit::Limits::of(12.5, 30.0, 10.0)))
             })

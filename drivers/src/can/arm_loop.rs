@@ -1,9 +1,11 @@
 //! The thread that moves an arm. It prepares the motors, enables them, sends setpoints, and stops permanently on any
 //! fault.
 //!
-//! It stops if a motor is silent or reports that it stopped, if a bus fails, or if this computer stalls for so long
-//! that the watchdogs of the motors have expired or are about to. After that, it discards earlier setpoints and sends
-//! no new ones until it receives [`Request::Recover`].
+//! It stops if a motor is silent, reports that it stopped or does not follow its commands, if a bus fails, or if this
+//! computer stalls for so long that the watchdogs of the motors have expired or are about to. After that, it discards
+//! earlier setpoints and sends no new ones until it receives [`Request::Recover`].
+//!
+//! It sends the motors their fail-safe command however it ends, also by a panic.
 
 use super::bus::Bus;
 use super::config::MovableArmConfig;
@@ -14,7 +16,7 @@ use super::motor::Reading;
 use super::movable_motor::MovableMotor;
 use super::plan::watchdog_plan;
 use super::watchdog::WatchdogPlan;
-use crate::motion::{JointTarget, Motion, MotionLimits, OnLoss, TrajectoryGenerator};
+use crate::motion::{CommandedArm, JointTarget, Motion, MotionLimits, OnLoss, TrajectoryGenerator};
 use crate::wire::can::Frame;
 use crate::wire::can::canopen::{self, NodeState};
 use crate::{Error, clock};
@@ -131,11 +133,14 @@ impl ArmLoop {
         })
     }
 
-    /// Runs until the owner drops the arm.
+    /// Runs until the owner drops the arm, or the program ends without an orderly stop.
     pub(super) fn run(mut self) {
         let mut next_cycle = clock::now();
         let mut shutdown_deadline = None;
         loop {
+            if CommandedArm::is_fail_safe_due() {
+                break;
+            }
             if self.is_shutting_down.load(Ordering::Relaxed) {
                 let shutdown_by = *shutdown_deadline.get_or_insert_with(|| clock::now() + self.max_stop_duration());
                 if self.is_at_rest() || clock::now() > shutdown_by {
@@ -393,7 +398,7 @@ impl ArmLoop {
     }
 
     /// Sends the fail-safe command, and resends it to motors that may not have received it.
-    fn end(mut self) {
+    fn end(&mut self) {
         let fail_safe = self.fail_safe_command();
         if let Some(prepared) = &self.prepared
             && !matches!(self.arm_state, ArmState::Stopped { .. })
@@ -408,6 +413,11 @@ impl ArmLoop {
             );
             self.arm_state = ArmState::stopped(clock::now(), Some(fail_safe));
         }
+        self.finish_fail_safe();
+    }
+
+    /// Resends the fail-safe command until all motors that may not have received it have answered, or for a limited time.
+    fn finish_fail_safe(&mut self) {
         while let ArmState::Stopped { pending_fail_safe: Some(_), .. } = self.arm_state {
             std::thread::sleep(self.plan.period);
             // A bus failure has already been reported.
@@ -446,6 +456,15 @@ impl ArmLoop {
             );
         }
         *pending_fail_safe = None;
+    }
+}
+
+impl Drop for ArmLoop {
+    fn drop(&mut self) {
+        if std::thread::panicking() {
+            self.abort("the thread of the arm failed; this is a bug, please report it");
+            self.finish_fail_safe();
+        }
     }
 }
 
@@ -567,8 +586,15 @@ impl PreparedMotors {
         self.movable_motors.iter().all(|movable_motor| movable_motor.health() == Some(&Health::Enabled))
     }
 
-    /// Checks that no motor is silent and that all are enabled.
+    /// Checks that no motor is silent, that all are enabled, and that all follow their commands.
     fn check(&self, now: Stamp, max_silence_allowed: Duration) -> Result<(), Error> {
+        for ((movable_motor, latest), sent_rad) in self.movable_motors.iter().zip(&self.latest).zip(&self.sent_rad) {
+            let Some(Reading { position_rad, effort_nm, .. }) = *latest else { continue };
+            let following = &movable_motor.config().following;
+            if let Some(violation) = following.violation(*sent_rad, position_rad, effort_nm) {
+                return Err(self.fault(movable_motor, violation));
+            }
+        }
         for (movable_motor, (stamp, cycle_ix)) in self.movable_motors.iter().zip(&self.last_heard) {
             match movable_motor.health() {
                 Some(Health::Enabled) => {}

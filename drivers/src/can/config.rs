@@ -69,15 +69,18 @@ pub struct MotorConfig {
     pub offset_rad: f64,
     /// Gains for families whose commands include them (MIT mode); `None` if the motor is only read.
     pub gains: Option<Gains>,
+    /// When the moving arm stops because this joint does not follow its commands.
+    pub following: FollowingLimits,
 }
 
 // This is not derived, because the derived code would move the trait object (rust-lang/rust#31740).
 impl PartialEq for MotorConfig {
     fn eq(&self, other: &Self) -> bool {
-        let Self { joint, bus_ix, protocol, gear_ratio, is_reversed, offset_rad, gains } = self;
+        let Self { joint, bus_ix, protocol, gear_ratio, is_reversed, offset_rad, gains, following } = self;
         protocol.as_ref() == other.protocol.as_ref()
             && (joint, bus_ix, is_reversed) == (&other.joint, &other.bus_ix, &other.is_reversed)
-            && (gear_ratio, offset_rad, gains) == (&other.gear_ratio, &other.offset_rad, &other.gains)
+            && (gear_ratio, offset_rad) == (&other.gear_ratio, &other.offset_rad)
+            && (gains, following) == (&other.gains, &other.following)
     }
 }
 
@@ -88,4 +91,59 @@ pub struct Gains {
     pub stiffness_nm_rad: f64,
     /// Torque per velocity error, N m s / rad of the joint.
     pub damping_nm_s_rad: f64,
+}
+
+/// Limits of a joint that is held by an obstacle or a person. Beyond them, the arm stops.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct FollowingLimits {
+    /// Following error: largest difference between the commanded and the reported position, rad or m.
+    pub max_error_rad: f64,
+    /// Largest effort that the motor may report, N m or N at the joint; `None` if it is not limited.
+    pub max_effort_nm: Option<f64>,
+    /// Move the joint without these limits.
+    pub is_off: bool,
+}
+
+impl Default for FollowingLimits {
+    fn default() -> Self {
+        Self { max_error_rad: 0.2, max_effort_nm: None, is_off: false }
+    }
+}
+
+impl FollowingLimits {
+    /// Why the joint counts as held; `None` if it follows its commands.
+    pub(super) fn violation(&self, commanded_rad: f64, position_rad: f64, effort_nm: Option<f64>) -> Option<String> {
+        if self.is_off {
+            return None;
+        }
+        let error_rad = (commanded_rad - position_rad).abs();
+        if error_rad > self.max_error_rad {
+            return Some(format!(
+                "it is {error_rad:.3} rad from its commanded position, and max_following_error_rad is {}: the joint is blocked, or its stiffness is too \
+                 low for its load",
+                self.max_error_rad
+            ));
+        }
+        let (effort_nm, max_effort_nm) = (effort_nm?.abs(), self.max_effort_nm?);
+        (effort_nm > max_effort_nm).then(|| {
+            format!("its effort is {effort_nm:.2} N m, and max_effort_nm is {max_effort_nm}: the joint is blocked or overloaded")
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn joint_is_held_beyond_either_limit() {
+        let limits = FollowingLimits { max_error_rad: 0.1, max_effort_nm: Some(4.0), is_off: false };
+        assert_eq!(limits.violation(0.5, 0.41, Some(-3.9)), None);
+        let error = limits.violation(0.5, 0.39, None).expect("the position is too far");
+        assert!(error.contains("0.110 rad") && error.contains("max_following_error_rad is 0.1"), "{error}");
+        let effort = limits.violation(0.5, 0.5, Some(-4.1)).expect("the effort is too large");
+        assert!(effort.contains("4.10 N m") && effort.contains("max_effort_nm is 4"), "{effort}");
+        assert_eq!(FollowingLimits { max_effort_nm: None, ..limits }.violation(0.5, 0.5, Some(99.0)), None);
+        assert_eq!(FollowingLimits { is_off: true, ..limits }.violation(0.0, 9.0, Some(99.0)), None);
+    }
 }

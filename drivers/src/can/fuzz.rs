@@ -3,7 +3,7 @@
 pub(crate) mod seeds;
 
 use super::FAMILIES;
-use super::config::MotorConfig;
+use super::config::{FollowingLimits, MotorConfig};
 use super::emulated::EmulatedMotor;
 use super::family::{LIMITS, MotorFamily};
 use super::motor::{MAX_RAD, Motor};
@@ -26,6 +26,7 @@ pub(crate) fn motors() -> Vec<MotorConfig> {
         is_reversed: ix % 2 == 1,
         offset_rad: 0.25,
         gains: None,
+        following: FollowingLimits::default(),
     };
     FAMILIES.iter().enumerate().map(motor).collect()
 }

@@ -55,7 +55,7 @@ mod watchdog;
 pub use arm::CanArm;
 #[cfg(target_os = "linux")]
 pub use bus::Bus;
-pub use config::{ArmConfig, BusConfig, Gains, MotorConfig, MovableArmConfig};
+pub use config::{ArmConfig, BusConfig, FollowingLimits, Gains, MotorConfig, MovableArmConfig};
 #[cfg(any(test, fuzzing))]
 pub use family::FamilyFuzzing;
 pub use family::{Health, MotionProtocol, MotorFamily, MotorProtocol, MotorReading, Reports, Traffic};

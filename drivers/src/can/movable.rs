@@ -8,7 +8,7 @@ use super::arm_loop::{ArmLoop, Request};
 use super::config::MovableArmConfig;
 use super::joints::{JointReading, Joints};
 use super::plan::watchdog_plan;
-use crate::motion::{JointTarget, Motion, MovableArm};
+use crate::motion::{CommandedArm, JointTarget, Motion, MotionLock, MovableArm};
 use crate::{Arm, Error};
 use kinematics::JointState;
 use parking_lot::Mutex;
@@ -36,6 +36,8 @@ pub struct MovableCanArm {
     motion: Arc<Mutex<Motion>>,
     is_shutting_down: Arc<AtomicBool>,
     thread: Option<JoinHandle<()>>,
+    /// Of all its buses, until the thread has ended.
+    _locks: Vec<MotionLock>,
 }
 
 impl MovableCanArm {
@@ -49,7 +51,8 @@ impl MovableCanArm {
     /// positions.
     ///
     /// # Errors
-    /// If any step fails. All motors are then disabled.
+    /// If another program moves motors on one of the buses; nothing is sent then. If any step fails; all motors are
+    /// then disabled.
     pub fn open(config: &MovableArmConfig) -> Result<Self, Error> {
         let names: Vec<String> = config.arm.motors.iter().map(|motor| motor.joint.clone()).collect();
         let (sender, readings) = sync_channel(MAX_WAITING);
@@ -58,11 +61,17 @@ impl MovableCanArm {
         let is_shutting_down = Arc::new(AtomicBool::new(false));
         let arm_loop =
             ArmLoop::new(config, request_receiver, sender, Arc::clone(&motion), Arc::clone(&is_shutting_down))?;
+        let locks = config.arm.buses.iter().map(|bus| MotionLock::take(&bus.interface)).collect::<Result<_, _>>()?;
         let device = "movable CAN arm".to_owned();
-        let thread = std::thread::Builder::new().name(device.clone()).spawn(move || arm_loop.run());
+        let commanded = CommandedArm::new();
+        let run = move || {
+            arm_loop.run();
+            drop(commanded);
+        };
+        let thread = std::thread::Builder::new().name(device.clone()).spawn(run);
         let thread = Some(thread.map_err(|source| Error::Thread { device, source })?);
         let joints = Joints::new(names.len());
-        let mut arm = Self { names, readings, joints, requests, motion, is_shutting_down, thread };
+        let mut arm = Self { names, readings, joints, requests, motion, is_shutting_down, thread, _locks: locks };
         arm.recover()?;
         Ok(arm)
     }

@@ -149,7 +149,7 @@ impl MovableMotor {
 #[cfg(test)]
 mod tests {
     use super::super::cia402::{Cia402, Units, codec::State};
-    use super::super::config::Gains;
+    use super::super::config::{FollowingLimits, Gains};
     use super::super::damiao::Damiao;
     use super::super::family::MotorProtocol;
     use super::*;
@@ -169,6 +169,7 @@ mod tests {
             is_reversed: true,
             offset_rad: 0.5,
             gains: Some(Gains { stiffness_nm_rad: 160.0, damping_nm_s_rad: 16.0 }),
+            following: FollowingLimits::default(),
         };
         MovableMotor::new(Motor::with_limits(config, LIMITS))
     }

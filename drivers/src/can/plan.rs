@@ -107,7 +107,7 @@ fn period(config: &MovableArmConfig, host: canopen::Node) -> Duration {
 #[cfg(test)]
 mod tests {
     use super::super::cia402::{Cia402, Units};
-    use super::super::config::{ArmConfig, BusConfig, Gains};
+    use super::super::config::{ArmConfig, BusConfig, FollowingLimits, Gains};
     use super::super::damiao::Damiao;
     use super::super::family::MotorProtocol;
     use super::super::odrive::{self, Endpoints, Odrive};
@@ -126,6 +126,7 @@ mod tests {
             is_reversed: false,
             offset_rad: 0.0,
             gains: None,
+            following: FollowingLimits::default(),
         });
         MovableArmConfig {
             arm: ArmConfig {
@@ -184,6 +185,7 @@ mod tests {
             is_reversed: false,
             offset_rad: 0.0,
             gains,
+            following: FollowingLimits::default(),
         };
         let plan = WatchdogPlan {
             on_loss,

@@ -74,7 +74,7 @@ fn settle(arm: &MovableFrankaArm) -> Result<(), String> {
 }
 
 /// Waits until a condition holds; panics with `expected` if it takes too long.
-fn wait_until(condition: impl Fn() -> bool, expected: &str) {
+fn wait_until(mut condition: impl FnMut() -> bool, expected: &str) {
     let deadline = Instant::now() + TEST_TIMEOUT;
     while !condition() {
         assert!(Instant::now() < deadline, "{expected}");
@@ -449,8 +449,16 @@ fn suspended_program_triggers_reflex_and_sends_nothing_stale() {
     assert_eq!(text(), "moving");
     std::thread::sleep(Duration::from_millis(300));
     signal("-STOP");
-    let n_before = n_moving.load(Ordering::Relaxed);
-    wait_until(|| !last_command.lock().unwrap().is_moving, "the robot stops on its own");
+    // Commands may still be on their way through the relay.
+    let (mut n_before, mut n_commands) = (0, 0);
+    let has_stopped = || {
+        let n_commands_before = std::mem::replace(&mut n_commands, relay.faults.n_commands.load(Ordering::Relaxed));
+        if n_commands > n_commands_before {
+            n_before = n_moving.load(Ordering::Relaxed);
+        }
+        !last_command.lock().unwrap().is_moving
+    };
+    wait_until(has_stopped, "the robot stops on its own");
     let n_without_answer = n_moving.load(Ordering::Relaxed) - n_before;
     assert!(n_without_answer <= MAX_WITHOUT_ANSWER, "the robot stopped after {n_without_answer} states");
     let n_commands = relay.faults.n_commands.load(Ordering::Relaxed);

@@ -6,7 +6,7 @@ use super::motion_loop::MotionLoop;
 use super::request::{self, ContactConfig};
 use super::session::Session;
 use super::{ArmConfig, FrankaArm, MotionStatistics, StateStatistics};
-use crate::motion::{JointTarget, Motion, MotionConfig, MotionLimits, MovableArm, OnLoss};
+use crate::motion::{JointTarget, Motion, MotionConfig, MotionLimits, MotionLock, MovableArm, OnLoss};
 use crate::{Arm, Error};
 use franka::{FciVersion, RobotMode};
 use kinematics::JointState;
@@ -34,6 +34,7 @@ pub struct MovableFrankaArm {
     contact: ContactConfig,
     limits: Vec<MotionLimits>,
     is_set: bool,
+    _lock: MotionLock,
 }
 
 impl MovableFrankaArm {
@@ -63,6 +64,7 @@ impl MovableFrankaArm {
     pub fn open(config: &ArmConfig, motion: &MotionConfig, contact: &ContactConfig) -> Result<Self, Error> {
         let address = config.address.clone();
         Self::check(motion).map_err(|reason| Error::Fci { address: address.clone(), reason })?;
+        let lock = MotionLock::take(&address)?;
         let mailbox = Arc::new(MotionMailbox::default());
         let connected = OnceLock::new();
         let arm = FrankaArm::open_with(config, |session, first| {
@@ -79,7 +81,7 @@ impl MovableFrankaArm {
             Ok(Some(motion_loop))
         })?;
         let (session, limits) = connected.into_inner().expect("an arm that is open has a session");
-        Ok(Self { address, arm, session, mailbox, contact: contact.clone(), limits, is_set: false })
+        Ok(Self { address, arm, session, mailbox, contact: contact.clone(), limits, is_set: false, _lock: lock })
     }
 
     /// Statistics of the states so far.

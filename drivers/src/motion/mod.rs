@@ -1,8 +1,16 @@
 //! Arms that may be moved: targets, motion limits, and fail-safe behavior if this computer stops sending.
 
+mod fail_safe;
 mod generator;
+#[cfg(target_os = "linux")]
+mod lock;
 
+#[cfg(target_os = "linux")]
+pub(crate) use fail_safe::CommandedArm;
+pub use fail_safe::apply_fail_safe;
 pub use generator::{Setpoint, TrajectoryGenerator};
+#[cfg(target_os = "linux")]
+pub(crate) use lock::MotionLock;
 
 use crate::{Arm, Error};
 use kinematics::urdf::JointLimits;

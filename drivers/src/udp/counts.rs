@@ -1,7 +1,9 @@
 //! Statistics of the datagrams of one device.
 
+use kinematics::Stamp;
 use std::fmt;
 use std::net::SocketAddr;
+use std::time::Duration;
 
 /// Statistics of the datagrams of one device since it was opened.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -12,6 +14,8 @@ pub struct DatagramCounts {
     pub n_rejected: u64,
     /// Number of missing sequence numbers and missing parts of scans.
     pub n_lost: u64,
+    /// Number of datagrams from other senders than the one that is being received from.
+    pub n_foreign: u64,
     /// Number of datagrams that were duplicates or arrived after a later one.
     pub n_late: u64,
     /// Number of datagrams dropped because the caller was too slow.
@@ -28,23 +32,35 @@ pub struct DatagramCounts {
 /// Message for a restart of the sender's clock.
 pub(super) const CLOCK_RESTARTED: &str = "the sender's clock restarted or jumped, or it does not count nanoseconds";
 
-/// Addresses of senders. Each port should have one sender; a restarted sender usually has a new address.
+/// A sender is received from until it has been silent for this long. Then another one may take its place: a restarted
+/// sender usually has a new address.
+const MAX_SENDER_SILENCE: Duration = Duration::from_secs(2);
+
+/// The sender that is being received from: one at a time, so that two programs cannot interleave their values.
 #[derive(Debug, Default)]
 pub(super) struct Senders {
-    newest: Option<SocketAddr>,
+    current: Option<(SocketAddr, Stamp)>,
     n_changes: u64,
 }
 
 impl Senders {
-    pub(super) fn note(&mut self, device: &str, from: SocketAddr) {
-        if self.newest.replace(from).is_some_and(|before| before != from) {
-            count_and_warn(
-                device,
-                &mut self.n_changes,
-                1,
-                format_args!("now receiving from {from}; another sender used this port before"),
-            );
+    /// Whether a datagram from this address is received. Counts and logs the others.
+    pub(super) fn accepts(&mut self, device: &str, from: SocketAddr, at: Stamp, n_foreign: &mut u64) -> bool {
+        match self.current {
+            Some((current, last)) if current != from && at.duration_since(last) < MAX_SENDER_SILENCE => {
+                let what = format_args!("ignored a datagram from {from}, because {current} is sending, too");
+                count_and_warn(device, n_foreign, 1, what);
+                return false;
+            }
+            Some((current, _)) if current != from => {
+                let what =
+                    format_args!("now receiving from {from}; {current} has been silent for {MAX_SENDER_SILENCE:?}");
+                count_and_warn(device, &mut self.n_changes, 1, what);
+            }
+            _ => {}
         }
+        self.current = Some((from, at));
+        true
     }
 }
 
@@ -61,11 +77,21 @@ pub(super) fn count_and_warn(device: &str, n: &mut u64, more: u64, what: impl fm
 impl DatagramCounts {
     /// Logs a summary if there were any problems.
     pub(super) fn summarize(&self, device: &str) {
-        let Self { n_received, n_rejected, n_lost, n_late, n_dropped, n_uncertain, n_restarts, n_clock_restarts } =
-            self;
-        if [n_rejected, n_lost, n_late, n_dropped, n_uncertain, n_restarts, n_clock_restarts].iter().any(|n| **n > 0) {
+        let Self {
+            n_received,
+            n_rejected,
+            n_lost,
+            n_foreign,
+            n_late,
+            n_dropped,
+            n_uncertain,
+            n_restarts,
+            n_clock_restarts,
+        } = self;
+        let problems = [n_rejected, n_lost, n_foreign, n_late, n_dropped, n_uncertain, n_restarts, n_clock_restarts];
+        if problems.iter().any(|n| **n > 0) {
             log::warn!(
-                "{device}: {n_received} datagrams: {n_rejected} rejected, {n_late} late or duplicate, {n_dropped} dropped because \
+                "{device}: {n_received} datagrams: {n_rejected} rejected, {n_foreign} from another sender, {n_late} late or duplicate, {n_dropped} dropped because \
                  the program was too slow, {n_uncertain} too uncertain; {n_lost} scans, poses or parts did not arrive; \
                  the sender's sequence numbers restarted {n_restarts} times, its clock {n_clock_restarts} times"
             );
@@ -76,6 +102,18 @@ impl DatagramCounts {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn second_sender_waits_until_the_first_is_silent() {
+        let (mut senders, mut n_foreign) = (Senders::default(), 0);
+        let [first, second] = [1, 2].map(|port| SocketAddr::from(([127, 0, 0, 1], port)));
+        let mut accepts = |from, millis: i64| senders.accepts("arm", from, Stamp(millis * 1_000_000), &mut n_foreign);
+        assert!(accepts(first, 0) && accepts(first, 1000));
+        assert!(!accepts(second, 1001) && !accepts(second, 2999));
+        assert!(accepts(second, 3000), "the first has been silent for 2 s");
+        assert!(!accepts(first, 3001) && accepts(second, 3002));
+        assert_eq!(n_foreign, 3);
+    }
 
     #[test]
     fn counts_saturate() {

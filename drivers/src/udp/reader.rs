@@ -78,7 +78,9 @@ impl DatagramReader {
                 return None;
             }
         };
-        senders.note(device, datagram.from);
+        if !senders.accepts(device, datagram.from, datagram.at, &mut counts.n_foreign) {
+            return None;
+        }
         match sequence.position(header.seq, datagram.at) {
             SequencePosition::New { n_lost } => {
                 count_and_warn(device, &mut counts.n_lost, n_lost, format_args!("{plural} did not arrive"))

@@ -82,7 +82,9 @@ impl UdpScanner {
         if *part.frame != *self.name {
             return self.reject(format_args!("it belongs to another frame"));
         }
-        self.senders.note(device, datagram.from);
+        if !self.senders.accepts(device, datagram.from, datagram.at, &mut self.counts.n_foreign) {
+            return;
+        }
         match self.sequence.position(part.header.seq, datagram.at) {
             SequencePosition::New { n_lost } => {
                 count_and_warn(self.receiver.device(), &mut self.counts.n_lost, n_lost, "scans did not arrive");

@@ -201,6 +201,24 @@ fn joint_states_are_ordered_and_other_joints_rejected() {
 }
 
 #[test]
+fn only_one_sender_is_received_from() {
+    let mut arm = UdpArm::open(&["shoulder".to_owned()], FREE_PORT.parse().unwrap()).unwrap();
+    let [first, second] = [sender(arm.address()), sender(arm.address())];
+    let state = |seq, at: f64| {
+        let state = JointsDatagram { header: now(seq), position: vec![at], velocity: vec![], effort: vec![] };
+        encode_joints(&state, &["shoulder".to_owned()])
+    };
+    first(&state(0, 0.25));
+    assert_eq!(arm.read(LONG_TIMEOUT).unwrap().position, [0.25]);
+    for seq in 1..50 {
+        second(&state(1000 * seq, 1.0));
+        first(&state(seq, 0.25));
+        assert_eq!(arm.read(LONG_TIMEOUT).unwrap().position, [0.25]);
+    }
+    assert_eq!(arm.counts(), DatagramCounts { n_received: 99, n_foreign: 49, ..DatagramCounts::default() });
+}
+
+#[test]
 fn live_merges_devices_and_names_silent_one() {
     let (scanner, send_scan) = scanner();
     let base = UdpBase::open(FREE_PORT.parse().unwrap(), MAX_SIGMA).unwrap();

@@ -61,6 +61,11 @@ impl EmulatedDrive {
         self.simulated_until = None;
     }
 
+    /// Sets mechanical stops of the shaft.
+    pub(super) fn set_stops(&mut self, stops_rad: [f64; 2]) {
+        self.shaft.stops_rad = stops_rad;
+    }
+
     /// Current motion of the shaft.
     pub(in crate::can) fn motion(&self) -> Motion {
         self.shaft.motion

@@ -47,6 +47,11 @@ impl EmulatedMotor {
         self.drive.set_motion(motion);
     }
 
+    /// Sets mechanical stops, the lowest and highest position of the shaft, as an obstacle does.
+    pub fn set_stops(&mut self, stops_rad: [f64; 2]) {
+        self.drive.set_stops(stops_rad);
+    }
+
     /// Current motion of the shaft.
     pub fn motion(&self) -> Motion {
         self.drive.motion()

@@ -33,11 +33,14 @@ pub(in crate::can) enum Actuation {
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Shaft {
     pub(super) motion: Motion,
+    /// Mechanical stops: lowest and highest position.
+    pub(super) stops_rad: [f64; 2],
 }
 
 impl Shaft {
     pub(super) fn at_rest() -> Self {
-        Self { motion: Motion { position_rad: 0.0, velocity_rad_s: 0.0, torque_nm: 0.0 } }
+        let motion = Motion { position_rad: 0.0, velocity_rad_s: 0.0, torque_nm: 0.0 };
+        Self { motion, stops_rad: [f64::NEG_INFINITY, f64::INFINITY] }
     }
 
     /// Advances the simulation by `secs`.
@@ -78,7 +81,9 @@ impl Shaft {
     }
 
     fn rotate(&mut self, velocity_rad_s: f64, secs: f64) {
-        let position_rad = self.motion.position_rad + velocity_rad_s * secs;
+        let free_rad = self.motion.position_rad + velocity_rad_s * secs;
+        let position_rad = free_rad.clamp(self.stops_rad[0], self.stops_rad[1]);
+        let velocity_rad_s = if position_rad == free_rad { velocity_rad_s } else { 0.0 };
         self.motion = Motion { position_rad, velocity_rad_s, torque_nm: 0.0 };
     }
 }
@@ -102,8 +107,18 @@ mod tests {
     }
 
     #[test]
+    fn blocked_shaft_stays_at_its_stop_under_torque() {
+        let command = Command { position_rad: 0.7, kp_nm_rad: 10.0, kd_nm_s_rad: 1.5, ..Command::default() };
+        let mut shaft = Shaft { stops_rad: [-1.0, 0.2], ..Shaft::at_rest() };
+        shaft.advance(0.9, &Actuation::Mit(command), &LIMITS);
+        assert!(shaft.motion.position_rad == 0.2 && shaft.motion.velocity_rad_s < 1e-9, "{:?}", shaft.motion);
+        assert!((shaft.motion.torque_nm - 5.0).abs() < 1e-9, "{:?}", shaft.motion);
+    }
+
+    #[test]
     fn free_shaft_coasts_and_stopping_shaft_rests() {
-        let moving = Shaft { motion: Motion { position_rad: 0.0, velocity_rad_s: 3.0, torque_nm: 0.0 } };
+        let motion = Motion { position_rad: 0.0, velocity_rad_s: 3.0, torque_nm: 0.0 };
+        let moving = Shaft { motion, ..Shaft::at_rest() };
         let (mut free, mut stopped) = (moving, moving);
         free.advance(0.2, &Actuation::Free, &LIMITS);
         stopped.advance(0.2, &Actuation::Stop, &LIMITS);

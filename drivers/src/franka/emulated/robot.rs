@@ -230,10 +230,12 @@ impl Robot {
         if has_contact { self.trigger_reflex("joint_reflex") } else { None }
     }
 
-    /// Handles the disconnection of the client.
+    /// Handles the disconnection of the client. During a motion, it is a reflex, as after missing commands.
     pub(super) fn abandon(&mut self) {
-        // No client is left to receive the reply.
-        let _ = self.end(MoveStatus::Aborted);
+        if matches!(self.mode, Mode::Move(_)) {
+            // No client is left to receive the reply.
+            let _ = self.trigger_reflex("communication_constraints_violation");
+        }
     }
 
     /// Fraction of the last states of a motion that were answered in time, 0 to 1; 0 without a motion.

@@ -150,6 +150,9 @@ impl MoveFlags {
             }
         }
         let stop = signals::stop_on_signals_logging("stopping the arm, then calibrating; Ctrl-C again exits at once")?;
+        if !is_simulated {
+            signals::stop_when_output_closes(&stop)?;
+        }
         let devices = if flags.sim { Devices::Sim } else { Devices::Real };
         let page = GuidancePage::start(&flags.page, &given_camera)?;
         let mut capture = ArmCapture::new(open::movable(&given, devices, camera)?)?;

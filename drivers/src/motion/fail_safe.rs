@@ -1,0 +1,46 @@
+//! Ends all motion of this process at once, before it exits without an orderly stop.
+
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::time::{Duration, Instant};
+
+/// Whether all arms must apply their fail-safe now.
+static IS_DUE: AtomicBool = AtomicBool::new(false);
+/// Arms that this process commands, and that need a fail-safe command.
+static N_COMMANDED: AtomicUsize = AtomicUsize::new(0);
+/// Longer than the time in which the fail-safe command is resent to motors without a watchdog.
+const MAX_WAIT: Duration = Duration::from_secs(5);
+
+/// Applies the fail-safe of all arms with CAN motors that this process moves, without bringing them to rest first, and
+/// waits until this is done, for at most 5 s. After that, these arms accept nothing. For use before the process ends
+/// without an orderly stop.
+///
+/// Franka arms brake by themselves when the process ends.
+pub fn apply_fail_safe() {
+    IS_DUE.store(true, Ordering::Relaxed);
+    let deadline = Instant::now() + MAX_WAIT;
+    while N_COMMANDED.load(Ordering::Relaxed) > 0 && Instant::now() < deadline {
+        std::thread::sleep(Duration::from_millis(2));
+    }
+}
+
+/// An arm that is commanded as long as this value exists.
+#[derive(Debug)]
+pub(crate) struct CommandedArm(());
+
+impl CommandedArm {
+    pub(crate) fn new() -> Self {
+        N_COMMANDED.fetch_add(1, Ordering::Relaxed);
+        Self(())
+    }
+
+    /// Whether the arm must apply its fail-safe now.
+    pub(crate) fn is_fail_safe_due() -> bool {
+        IS_DUE.load(Ordering::Relaxed)
+    }
+}
+
+impl Drop for CommandedArm {
+    fn drop(&mut self) {
+        N_COMMANDED.fetch_sub(1, Ordering::Relaxed);
+    }
+}
