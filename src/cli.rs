@@ -23,6 +23,9 @@ pub(crate) struct Cli {
     /// Log debug messages on stderr; repeat to log everything
     #[arg(short, long, global = true, action = ArgAction::Count)]
     pub(crate) verbose: u8,
+    /// Let other users of this computer read what `run`, `record` and `train` write, as the umask allows
+    #[arg(long, global = true)]
+    pub(crate) public_files: bool,
     #[command(subcommand)]
     pub(crate) command: Command,
 }
@@ -63,6 +66,11 @@ pub(crate) enum Command {
 }
 
 impl Command {
+    /// Whether its results show where the robot was, so that other users of this computer must not read them.
+    pub(crate) fn is_private(&self) -> bool {
+        matches!(self, Self::Run(_) | Self::Record(_) | Self::Train(_))
+    }
+
     /// Runs the command.
     pub(crate) fn run(self) -> anyhow::Result<Exit> {
         match self {

@@ -21,6 +21,10 @@ fn main() -> ExitCode {
     keep_wayland_quiet();
     let cli = cli::Cli::parse();
     print::start_log(cli.verbose);
+    if cli.command.is_private() && !cli.public_files {
+        // New folders get the mode 0700, and new files 0600.
+        rustix::process::umask(rustix::fs::Mode::from_raw_mode(0o077));
+    }
     let result = cli.command.run();
     if let Err(error) = &result
         && !exit::is_broken_pipe(error)

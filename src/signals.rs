@@ -7,9 +7,9 @@
 
 use anyhow::Context;
 use capture::Stop;
+use files::partial;
 use rustix::event::{PollFd, PollFlags, poll};
 use rustix::io::Errno;
-use session::partial;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 use signal_hook::iterator::Signals;
 use signal_hook::low_level;

@@ -93,7 +93,7 @@ th:first-child,td:first-child{text-align:left}h1{font-size:1.5rem}h2{font-size:1
 .wide{overflow-x:auto}</style>\n";
 
 fn write_file(path_with: &Path, bytes: &[u8]) -> Result<()> {
-    std::fs::write(path_with, bytes).with_context(|| format!("cannot write {}", path_with.display()))
+    files::write(path_with, bytes).with_context(|| format!("cannot write {}", path_with.display()))
 }
 
 #[cfg(test)]

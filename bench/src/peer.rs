@@ -36,7 +36,7 @@ impl Peer {
     /// If the file is unreadable or has another format.
     pub(crate) fn load(path: &Path) -> Result<Self> {
         let invalid = |reason: &str| Error::BadInput(format!("--peer {}: {reason}", path.display()));
-        let text = std::fs::read_to_string(path).map_err(|error| invalid(&format!("cannot be read ({error})")))?;
+        let text = files::read_text(path).map_err(|error| invalid(&format!("cannot be read ({error})")))?;
         let file: File = serde_json::from_str(&text)
             .map_err(|error| invalid(&format!("expected an object with rows of seconds and psnr ({error})")))?;
         if file.rows.is_empty() || file.rows.iter().any(|row| row.seconds <= 0.0) {

@@ -430,7 +430,7 @@ fn from_evaluation(evaluation: &Evaluation) -> RunScores {
 
 fn read(path: &Path) -> Result<Run> {
     let message = || format!("{} is not a finished run; remove it to repeat the run", path.display());
-    let text = std::fs::read_to_string(path).with_context(message)?;
+    let text = files::read_text(path).with_context(message)?;
     serde_json::from_str(&text).with_context(message)
 }
 

@@ -6,8 +6,6 @@
 #![no_main]
 #![allow(dead_code, reason = "only reading is tested here")]
 
-#[path = "../../trainer/src/atomic_file.rs"]
-mod atomic_file;
 #[path = "../../trainer/src/checkpoint.rs"]
 mod checkpoint;
 #[path = "../../trainer/src/splat/ply/mod.rs"]

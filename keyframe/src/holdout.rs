@@ -33,7 +33,7 @@ impl Holdout {
                 .map(Self::Every)
                 .ok_or_else(|| invalid("must be at least 1, or a file that lists photos"));
         }
-        let text = std::fs::read_to_string(Path::new(argument))
+        let text = files::read_text(Path::new(argument))
             .map_err(|error| invalid(&format!("neither a whole number nor a readable file ({error})")))?;
         let names: Vec<_> = text.lines().map(str::trim).filter(|name| !name.is_empty()).map(str::to_owned).collect();
         if names.is_empty() { Err(invalid("the file lists no photo")) } else { Ok(Self::Named(names)) }

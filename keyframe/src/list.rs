@@ -23,7 +23,7 @@ impl KeyframeList {
     ///
     /// If the file cannot be read, lists no keyframe, or has an invalid line.
     pub fn load(path: &Path) -> Result<Self, Error> {
-        let read = std::fs::read_to_string(path);
+        let read = files::read_text(path);
         let text = read.map_err(|error| Error::Read { path: path.to_owned(), reason: error.to_string() })?;
         Self::parse(&text).map_err(|reason| Error::List { path: path.to_owned(), reason })
     }

@@ -69,7 +69,7 @@ pub fn write(folder: &Path, cameras: &[PosedCamera]) -> crate::Result<()> {
 /// Reads the list; `None` if the folder has none.
 pub fn read(folder: &Path) -> crate::Result<Option<Vec<KeyframePose>>> {
     let path = folder.join(FILE);
-    let text = match std::fs::read_to_string(&path) {
+    let text = match files::read_text(&path) {
         Ok(text) => text,
         Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(None),
         Err(error) => return Err(error).with_context(|| format!("cannot read {}", path.display())),

@@ -49,7 +49,7 @@ struct PathFileCamera {
 impl CameraPath {
     /// Reads a nerfstudio camera path and converts its cameras to the axes of [`kinematics::camera`].
     pub fn load(path: &Path) -> crate::Result<Self> {
-        let text = std::fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))?;
+        let text = files::read_text(path).with_context(|| format!("cannot read {}", path.display()))?;
         Self::parse(&text).with_context(|| format!("the nerfstudio camera path {}", path.display()))
     }
 

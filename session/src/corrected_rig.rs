@@ -173,7 +173,7 @@ pub fn check_target_file(rig: &Rig, file: &Path) -> Result<(), Error> {
 /// Path of the URDF next to a rig file, if it describes another robot.
 fn other_robot(rig: &Rig, file: &Path) -> Option<PathBuf> {
     let urdf = file.with_file_name(drivers::recording::URDF_FILE);
-    let existing = std::fs::read_to_string(&urdf).ok()?;
+    let existing = files::read_text(&urdf).ok()?;
     (existing != rig.arm.urdf_text).then_some(urdf)
 }
 
@@ -184,10 +184,11 @@ pub fn write(rig: &Rig, file: &Path) -> crate::Result<()> {
     let urdf = file.with_file_name(drivers::recording::URDF_FILE);
     let in_file = || format!("cannot write {}", file.display());
     if !urdf.exists() {
-        std::fs::write(&urdf, &rig.arm.urdf_text).with_context(in_file)?;
+        files::write(&urdf, &rig.arm.urdf_text).with_context(in_file)?;
     }
     if file.exists() {
-        std::fs::copy(file, unused_backup(file)).with_context(in_file)?;
+        let copy = |backup: &mut std::fs::File| std::io::copy(&mut files::open(file)?, backup).map(drop);
+        files::create(&unused_backup(file), copy).with_context(in_file)?;
     }
     run_folder::write_atomic(file, &rig.to_toml()).with_context(in_file)
 }

@@ -1,8 +1,8 @@
 //! Exports keyframes as a nerfstudio dataset: color PNG, 16-bit depth, poses, split lists.
 
 use crate::error::Context;
-use crate::partial::Partial;
 use drivers::dataset::nerfstudio;
+use files::partial::Partial;
 use image::ExtendedColorType;
 use keyframe::{DepthMap, Keyframe, Split};
 use keyframe::{bail, ensure};
@@ -49,6 +49,9 @@ pub fn write_nerfstudio(out: &Path, keyframes: impl Iterator<Item = Arc<Keyframe
     let transforms = out.join(nerfstudio::FILE_NAME);
     if let Some(existing) = ENTRIES.iter().map(|entry| out.join(entry)).find(|entry| entry.exists()) {
         bail!("{} already exists: give another folder", existing.display());
+    }
+    for entry in ENTRIES {
+        files::check_no_link(&out.join(entry)).context("cannot export")?;
     }
     let partial = Partial::folder(out, &ENTRIES);
     let mut written = Written::default();
@@ -160,7 +163,7 @@ fn write_png(path: &Path, size_px: [u32; 2], bytes: &[u8], color: ExtendedColorT
 }
 
 fn write_text(path: &Path, text: &str) -> crate::Result<()> {
-    std::fs::write(path, text).with_context(|| format!("cannot write {}", path.display()))
+    files::write(path, text).with_context(|| format!("cannot write {}", path.display()))
 }
 
 #[cfg(test)]

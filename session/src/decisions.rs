@@ -10,7 +10,6 @@ use keyframe::{Keyframe, Split, split_from_name, split_name};
 use kinematics::{Stamp, Transform};
 use nalgebra::{Quaternion, Translation3, UnitQuaternion};
 use serde::{Deserialize, Serialize};
-use std::fs::File;
 use std::io::Write;
 use std::path::Path;
 use std::sync::Arc;
@@ -245,7 +244,7 @@ impl DecisionLog {
             Some(step) => FILE.replace('.', &format!("-from-{step}.")),
         };
         let path = folder.join(name);
-        let mut file = File::create(&path).with_context(|| format!("cannot write {}", path.display()))?;
+        let mut file = files::begin(&path).with_context(|| format!("cannot write {}", path.display()))?;
         let (sender, lines) = sync_channel(MAX_WAITING);
         let thread = std::thread::Builder::new().name("decisions".into()).spawn(move || {
             // Written line by line, so that all decisions so far are on disk if the process is killed.
@@ -378,7 +377,7 @@ pub struct Decisions {
 
 impl Decisions {
     pub fn load(path: &Path) -> crate::Result<Self> {
-        let text = std::fs::read_to_string(path).with_context(|| format!("cannot read the decision log {path:?}"))?;
+        let text = files::read_text(path).with_context(|| format!("cannot read the decision log {path:?}"))?;
         Self::parse(&text).with_context(|| format!("the decision log {path:?}"))
     }
 

@@ -38,7 +38,8 @@ impl DepthSource {
         let invalid = |error: crate::Error| Error::BadInput(format!("--depth-from: {error:#}"));
         run_folder::expect_model(model).map_err(invalid)?;
         let sha256 = if model.is_file() {
-            let bytes = std::fs::read(model).with_context(|| format!("cannot read {}", model.display()))?;
+            let bytes =
+                files::read(model, files::NO_LIMIT).with_context(|| format!("cannot read {}", model.display()))?;
             run_folder::hex(&Sha256::digest(bytes))
         } else {
             run_folder::checkpoint_sha256(model)?

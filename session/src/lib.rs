@@ -44,7 +44,6 @@ pub mod methods;
 pub mod next_commands;
 mod observations;
 mod observer;
-pub mod partial;
 mod pending_evaluation;
 mod read_progress;
 pub mod recoveries;

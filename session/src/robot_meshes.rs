@@ -69,7 +69,7 @@ fn read(file: &str, urdf_folder: &Path, n_free: u64) -> Result<RobotMesh, String
     if n_bytes > max_bytes {
         return Err(format!("{shown} has {n_bytes} bytes, expected at most {max_bytes}: reduce its triangles"));
     }
-    let bytes = std::fs::read(path).map_err(|error| format!("cannot read {shown}: {error}"))?;
+    let bytes = files::read(path, max_bytes).map_err(|error| format!("cannot read {shown}: {error}"))?;
     Ok(RobotMesh { file: file.to_owned(), format, bytes: bytes.into() })
 }
 

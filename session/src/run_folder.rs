@@ -7,7 +7,6 @@ use keyframe::{Keyframe, listed};
 use keyframe::{bail, ensure};
 use serde::Serialize;
 use sha2::{Digest, Sha256};
-use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
@@ -21,6 +20,8 @@ const RUNS: &str = "runs";
 const PARTIAL_MODEL: &str = "model.part";
 /// The checkpoint in the folder of a run.
 pub const CHECKPOINT: &str = "training.ckpt";
+/// Subfolder with the keyframes of a run.
+pub(crate) const KEYFRAMES: &str = "keyframes";
 /// Lock file, held while a run writes into a folder.
 const LOCK: &str = ".lock";
 const SECS_PER_DAY: u64 = 86_400;
@@ -256,17 +257,20 @@ fn make_in(parent: &Path, prefix: &str) -> crate::Result<PathBuf> {
     bail!("{} and 98 numbered variants already exist: give a folder with --out", parent.join(name).display())
 }
 
-/// Locks a folder against other runs for the lifetime of this process.
+/// Locks a folder against other runs for the lifetime of this process. A folder whose subfolders are links is rejected: it
+/// may come from somebody else, and files written through its links would replace other files.
 fn lock(folder: &Path) -> crate::Result<()> {
+    let of_methods = ModelKind::ALL.iter().map(|kind| kind.name());
+    for subfolder in [PARTIAL_MODEL, KEYFRAMES].into_iter().chain(of_methods) {
+        files::check_no_link(&folder.join(subfolder)).map_err(|link| Error::BadInput(link.to_string()))?;
+    }
     let path = folder.join(LOCK);
-    let file = std::fs::File::create(&path).with_context(|| format!("cannot write {}", path.display()))?;
-    match file.try_lock() {
-        Ok(()) => std::mem::forget(file), // The system releases the lock when the process ends.
-        Err(std::fs::TryLockError::WouldBlock) => {
+    match files::lock(&path).with_context(|| format!("cannot write {}", path.display()))? {
+        Some(file) => std::mem::forget(file), // The system releases the lock when the process ends.
+        None => {
             let message = format!("--out {}: another run uses this folder; give another one", folder.display());
             return Err(Error::BadInput(message));
         }
-        Err(std::fs::TryLockError::Error(error)) => log::debug!("cannot lock {}: {error}", path.display()),
     }
     Ok(())
 }
@@ -307,7 +311,7 @@ pub fn write_json(path: &Path, report: &impl Serialize) -> crate::Result<()> {
 
 /// Writes a file atomically: `path` never refers to an incomplete file.
 pub fn write_atomic(path: &Path, text: &str) -> crate::Result<()> {
-    Ok(trainer::atomic_file::write(path, |file| file.write_all(text.as_bytes()))?)
+    files::write(path, text).with_context(|| format!("cannot write {}", path.display()))
 }
 
 /// Writes the list of keyframes and their splits that `--keyframes` accepts.
@@ -324,7 +328,7 @@ pub fn checkpoint_sha256(folder: &Path) -> crate::Result<String> {
         if !path.exists() {
             continue;
         }
-        let bytes = std::fs::read(&path).with_context(|| format!("cannot read {}", path.display()))?;
+        let bytes = files::read(&path, files::NO_LIMIT).with_context(|| format!("cannot read {}", path.display()))?;
         hash.update(format!("{name} {}\n", bytes.len()));
         hash.update(&bytes);
         n_files += 1;

@@ -4,6 +4,7 @@
 //! as PNG. Ground truth from a simulator is left out.
 
 use crate::error::Context;
+use crate::run_folder::KEYFRAMES;
 use image::codecs::png::{CompressionType, FilterType, PngEncoder};
 use image::{ExtendedColorType, ImageEncoder};
 use keyframe::ensure;
@@ -16,8 +17,6 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use trainer::checkpoint::{Array, Checkpoint};
 
-/// Name of the folder in the folder of a run.
-pub(crate) const FOLDER: &str = "keyframes";
 const EXTENSION: &str = "keyframe";
 const METHOD: &str = "keyframe";
 const COLOR: &str = "rgba_srgb.png";
@@ -67,7 +66,7 @@ struct BaseDescription {
 impl StoredKeyframes {
     /// The stored keyframes of the run in this folder. Does not access the disk.
     pub fn of_run(run: &Path) -> Self {
-        Self { folder: run.join(FOLDER) }
+        Self { folder: run.join(KEYFRAMES) }
     }
 
     /// Writes the keyframes that are not stored yet.
@@ -296,7 +295,7 @@ mod tests {
         let stored = StoredKeyframes::of_run(run.path());
         assert!(stored.read().is_err(), "no folder yet");
         stored.add(&[keyframe(1, true)]).expect("disk space");
-        let path = run.path().join(FOLDER).join("wrist_00000000000000000001.keyframe");
+        let path = run.path().join(KEYFRAMES).join("wrist_00000000000000000001.keyframe");
         let mut bytes = std::fs::read(&path).expect("a file");
         let middle = bytes.len() / 2;
         bytes[middle] ^= 1;

@@ -109,7 +109,7 @@ fn n_trained_on(args: &Args, tests: &[Arc<Keyframe>], is_recording: bool) -> usi
 
 /// The data that a model was trained on, according to its report.
 fn trained_folder(model: &Path) -> Option<PathBuf> {
-    let report = std::fs::read_to_string(model.join("report.json")).ok()?;
+    let report = files::read_text(&model.join("report.json")).ok()?;
     let report: serde_json::Value = serde_json::from_str(&report).ok()?;
     Path::new(report["data"].as_str()?).canonicalize().ok()
 }

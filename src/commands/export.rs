@@ -8,7 +8,6 @@ use capture::config::Override;
 use capture::{Join, SampleUse, Stations, open};
 use clap::builder::{PossibleValue, PossibleValuesParser};
 use keyframe::{KeyframeList, counted, listed};
-use session::partial::Partial;
 use session::{Written, methods, run_folder, write_nerfstudio};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -138,19 +137,22 @@ fn unsupported(sentence: &str, args: &Args) -> anyhow::Error {
 
 /// Exports a model.
 fn export_model(export: &Export, args: &Args) -> anyhow::Result<Exit> {
-    let request = ExportRequest { model: &args.from, out: &args.out, cell_m: args.cell_m };
-    let partial = Partial::file(&args.out);
-    let exported = match export.write {
-        ExportWriter::Cpu(write) => write(&request),
-        ExportWriter::Gpu(write) => write(open_gpu()?, &request),
+    let export = |out: &Path| -> anyhow::Result<Exported> {
+        let request = ExportRequest { model: &args.from, out, cell_m: args.cell_m };
+        let exported = match export.write {
+            ExportWriter::Cpu(write) => write(&request),
+            ExportWriter::Gpu(write) => write(open_gpu()?, &request),
+        };
+        exported.map_err(|error| match error {
+            trainer::Error::EmptyMesh { cell_m } => anyhow::Error::new(BadArgument(format!(
+                "--cell-m {cell_m}: no triangles are left at this cell width; use a smaller one"
+            ))),
+            error => error.into(),
+        })
     };
-    let Exported { n_items, item, detail } = exported.map_err(|error| match error {
-        trainer::Error::EmptyMesh { cell_m } => anyhow::Error::new(BadArgument(format!(
-            "--cell-m {cell_m}: no triangles are left at this cell width; use a smaller one"
-        ))),
-        error => error.into(),
-    })?;
-    partial.keep();
+    let exported = files::create_from(&args.out, export);
+    let Exported { n_items, item, detail } =
+        exported.with_context(|| format!("cannot write {}", args.out.display()))?;
     let separator = if detail.is_empty() { "" } else { " " };
     print::report(format!("{}{separator}{detail} -> {}", counted(n_items, item), args.out.display()));
     Ok(Exit::Done)

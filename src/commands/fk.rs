@@ -52,7 +52,7 @@ pub(crate) fn run(args: Args) -> anyhow::Result<()> {
 }
 
 fn read(path: &Path) -> anyhow::Result<String> {
-    std::fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))
+    files::read_text(path).with_context(|| format!("cannot read {}", path.display()))
 }
 
 fn chain(robot: &Robot, args: &Args) -> Result<Chain, kinematics::Error> {

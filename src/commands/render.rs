@@ -9,7 +9,6 @@ use serde::Serialize;
 use session::camera_path::{CameraPath, PathCamera};
 use session::evaluate::{covered_frac, warn_if_hardly_covered};
 use session::methods;
-use session::partial::Partial;
 use session::run_folder::expect_model;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -187,24 +186,23 @@ fn check_no_overwrite(folder: &Path, n: usize) -> Result<(), BadArgument> {
 fn write(folder: &Path, ix: usize, picture: &Picture, with_depth: bool) -> anyhow::Result<(PathBuf, Option<PathBuf>)> {
     let [width, height] = picture.size_px;
     let [file, depth] = files(folder, ix);
-    let partial = Partial::file(&file);
-    image::save_buffer(&file, &picture.rgba_srgb, width, height, image::ExtendedColorType::Rgba8)
-        .with_context(|| format!("cannot write {}", file.display()))?;
-    partial.keep();
+    let write_png = |inside: &Path| -> anyhow::Result<()> {
+        Ok(image::save_buffer(inside, &picture.rgba_srgb, width, height, image::ExtendedColorType::Rgba8)?)
+    };
+    files::create_from(&file, write_png).with_context(|| format!("cannot write {}", file.display()))?;
     let depth = with_depth.then_some(depth);
     if let Some(depth) = &depth {
-        let partial = Partial::file(depth);
-        write_npy(depth, picture).with_context(|| format!("cannot write {}", depth.display()))?;
-        partial.keep();
+        files::create(depth, |file| write_npy(file, picture))
+            .with_context(|| format!("cannot write {}", depth.display()))?;
     }
     Ok((file, depth))
 }
 
 /// Writes depth as a `[height, width]` array of 32-bit floats.
-fn write_npy(file: &Path, picture: &Picture) -> std::io::Result<()> {
+fn write_npy(file: &mut std::fs::File, picture: &Picture) -> std::io::Result<()> {
     use npyz::WriterBuilder;
     let [width, height] = picture.size_px.map(u64::from);
-    let to = std::io::BufWriter::new(std::fs::File::create(file)?);
+    let to = std::io::BufWriter::new(file);
     let mut writer = npyz::WriteOptions::new().default_dtype().shape(&[height, width]).writer(to).begin_nd()?;
     writer.extend(picture.depth_m.iter())?;
     writer.finish()

@@ -362,10 +362,14 @@ impl Args {
         flags.chain(self.checkpoints.options().flag()).collect()
     }
 
-    /// Returns these flags; missing ones are taken from the previous run.
+    /// Returns these flags; missing ones are taken from the previous run. The path of an output is not, because the
+    /// checkpoint may come from somebody else.
     fn with_flags_of(&self, checkpoint: &Checkpoint) -> Self {
         let flag = |name: &str| checkpoint.flags.get(name);
         let path = |name: &str| flag(name).map(PathBuf::from);
+        if let (None, Some(file)) = (&self.write_rig, flag(WRITE_RIG)) {
+            log::warn!("no rig file is written: the previous run wrote {file:?}; to write it again, add --write-rig");
+        }
         let has_limit = self.seconds.is_some() || self.steps.is_some();
         let limit = |name: &str| flag(name).filter(|_| !has_limit);
         Self {
@@ -373,7 +377,6 @@ impl Args {
             steps: self.steps.or_else(|| limit(STEPS)?.parse().ok()),
             depth_from: self.depth_from.clone().or_else(|| path(DEPTH_FROM)),
             lpips_weights: self.lpips_weights.clone().or_else(|| path(LPIPS_WEIGHTS)),
-            write_rig: self.write_rig.clone().or_else(|| path(WRITE_RIG)),
             profile: self.profile || flag(PROFILE).is_some(),
             checkpoints: self.checkpoints.options().or_previous(&checkpoint.flags).into(),
             ..self.clone()

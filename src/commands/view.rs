@@ -159,7 +159,7 @@ fn first_view(cameras: &[KeyframePose], bounds: Option<Bounds>, model_from_page:
 
 /// The report in a model's folder; `Null` if there is none.
 fn report(model: &Path) -> Value {
-    let text = std::fs::read_to_string(model.join("report.json")).unwrap_or_default();
+    let text = files::read_text(&model.join("report.json")).unwrap_or_default();
     serde_json::from_str(&text).unwrap_or_default()
 }
 

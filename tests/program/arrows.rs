@@ -5,20 +5,21 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::process::Command;
 
 /// Every crate, and the workspace crates that it may depend on.
-const ALLOWED: [(&str, &[&str]); 14] = [
+const ALLOWED: [(&str, &[&str]); 15] = [
+    ("files", &[]),
     ("kinematics", &[]),
-    ("keyframe", &["kinematics"]),
+    ("keyframe", &["files", "kinematics"]),
     ("calibration", &["keyframe", "kinematics"]),
-    ("drivers", &["kinematics"]),
+    ("drivers", &["files", "kinematics"]),
     ("sim", &["drivers", "kinematics", "targets"]),
     ("targets", &["kinematics"]),
     ("test-features", &[]),
     ("test-support", &[]),
-    ("capture", &["calibration", "drivers", "keyframe", "kinematics", "sim"]),
-    ("trainer", &["calibration", "keyframe", "kinematics"]),
+    ("capture", &["calibration", "drivers", "files", "keyframe", "kinematics", "sim"]),
+    ("trainer", &["calibration", "files", "keyframe", "kinematics"]),
     ("viz", &["keyframe", "kinematics", "trainer"]),
-    ("session", &["calibration", "capture", "drivers", "keyframe", "kinematics", "trainer", "viz"]),
-    ("bench", &["calibration", "capture", "keyframe", "kinematics", "session", "trainer"]),
+    ("session", &["calibration", "capture", "drivers", "files", "keyframe", "kinematics", "trainer", "viz"]),
+    ("bench", &["calibration", "capture", "files", "keyframe", "kinematics", "session", "trainer"]),
     (
         "fieldrig",
         &[
@@ -26,6 +27,7 @@ const ALLOWED: [(&str, &[&str]); 14] = [
             "calibration",
             "capture",
             "drivers",
+            "files",
             "keyframe",
             "kinematics",
             "session",

@@ -23,6 +23,7 @@ mod page_server;
 mod photos;
 #[cfg(feature = "realsense")]
 mod realsense;
+mod received_files;
 mod resume;
 mod robot_silhouette;
 #[cfg(feature = "sim")]

@@ -156,6 +156,12 @@ impl<M: Recalibrate + 'static> Aligned<M> {
 
     /// A saved model, with the alignment stored in its folder.
     pub fn load(model: M, folder: &Path) -> Result<Self, Error> {
+        if !folder.join(METADATA_FILE).exists() {
+            log::warn!(
+                "{} has no {METADATA_FILE}: the corrections of the cameras and the background of the model are unknown",
+                folder.display()
+            );
+        }
         let alignment_task = AlignmentTask::done(read_metadata(folder)?.alignment);
         Ok(Self { alignment_task, ..Self::new(model, CameraRefinement::default(), false, 0) })
     }
@@ -524,12 +530,13 @@ impl<M: Recalibrate + 'static> Method for Aligned<M> {
         let path = folder.join(METADATA_FILE);
         let invalid_file =
             |error: serde_json::Error| Error::SplatFile { path: path.clone(), reason: error.to_string() };
-        let bytes = std::fs::read(&path).map_err(|source| Error::Read { path: path.clone(), source })?;
+        let bytes =
+            files::read(&path, files::MAX_TEXT_BYTES).map_err(|source| Error::Read { path: path.clone(), source })?;
         let mut metadata: serde_json::Map<String, serde_json::Value> =
             serde_json::from_slice(&bytes).map_err(invalid_file)?;
         metadata.insert(METADATA_KEY.to_owned(), serde_json::to_value(alignment).map_err(invalid_file)?);
         let text = format!("{:#}\n", serde_json::Value::Object(metadata));
-        std::fs::write(&path, text).map_err(|source| Error::Write { path: path.clone(), source })
+        files::write(&path, text).map_err(|source| Error::Write { path: path.clone(), source })
     }
 
     fn checkpoint(&mut self) -> Result<PendingCheckpoint, Error> {

@@ -2,9 +2,9 @@
 //!
 //! `docs/reference/files.md` describes the layout.
 
+use crate::Error;
 use crate::edits::Edits;
 use crate::pending::Pending;
-use crate::{Error, atomic_file};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;
@@ -93,12 +93,14 @@ impl Checkpoint {
     /// Writes the file under a temporary name, syncs it and renames it. The final name therefore always refers to a
     /// complete file: the previous one or the new one.
     pub fn write(&self, path: &Path) -> Result<(), Error> {
-        atomic_file::write(path, |file| self.write_to(file))
+        files::replace(path, |file| self.write_to(file))
+            .map_err(|source| Error::Write { path: path.to_owned(), source })
     }
 
     /// Reads a file and verifies its checksum.
     pub fn read(path: &Path) -> Result<Self, Error> {
-        let bytes = std::fs::read(path).map_err(|source| Error::Read { path: path.to_owned(), source })?;
+        let bytes =
+            files::read(path, files::NO_LIMIT).map_err(|source| Error::Read { path: path.to_owned(), source })?;
         Self::from_bytes(&bytes).map_err(|reason| Error::Checkpoint { path: path.to_owned(), reason })
     }
 

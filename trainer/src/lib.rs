@@ -45,7 +45,6 @@ mod submits;
 #[cfg(test)]
 mod test_scenes;
 
-pub mod atomic_file;
 pub mod tsdf;
 mod view;
 

@@ -26,7 +26,7 @@ pub(crate) struct ModelMetadata {
 pub(crate) fn read_metadata(folder: &Path) -> Result<ModelMetadata, Error> {
     let path = folder.join(METADATA_FILE);
     let invalid_file = |reason: String| Error::SplatFile { path: path.clone(), reason };
-    match std::fs::read(&path) {
+    match files::read(&path, files::MAX_TEXT_BYTES) {
         Ok(bytes) => serde_json::from_slice(&bytes).map_err(|error| invalid_file(error.to_string())),
         Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(ModelMetadata::default()),
         Err(error) => Err(invalid_file(error.to_string())),

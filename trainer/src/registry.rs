@@ -45,7 +45,7 @@ impl ModelKind {
     ///
     /// # Errors
     ///
-    /// Fails if `model.json` is invalid.
+    /// Fails if `model.json` is invalid or cannot be read.
     pub fn of_saved(model: &Path) -> Result<Option<Self>, Error> {
         #[derive(serde::Deserialize)]
         struct Metadata {
@@ -57,7 +57,10 @@ impl ModelKind {
         let is_complete = |kind: &Self| kind.0.files.last().is_some_and(|file| model.join(file).is_file());
         let by_files = || Self::ALL.iter().copied().find(is_complete);
         let path = model.join(METADATA_FILE);
-        let Ok(bytes) = std::fs::read(&path) else { return Ok(by_files()) };
+        let bytes = match files::read(&path, files::MAX_TEXT_BYTES) {
+            Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(by_files()),
+            read => read.map_err(|source| Error::Read { path: path.clone(), source })?,
+        };
         let metadata: Metadata =
             serde_json::from_slice(&bytes).map_err(|source| Error::ModelMetadata { path, source })?;
         Ok(metadata.method.as_deref().and_then(Self::from_name).or_else(by_files))

@@ -37,11 +37,12 @@ impl Certificate {
                 .map_err(|error| Error::Certificate { file: file.clone(), reason: error.to_string() })?;
             create(folder, &file, &pem).map_err(|source| Error::WriteCertificate { file: file.clone(), source })?;
         }
-        check_is_private(&file)?;
+        check_is_private(&file, GROUP_AND_OTHERS)?;
         Self::read(&file, &file)
     }
 
-    /// Reads a certificate with its chain, and its private key, from PEM files. They may be the same file.
+    /// Reads a certificate with its chain, and its private key, from PEM files. They may be the same file. A key that every
+    /// user can read is refused; a group may read it, as is usual for keys that several programs use.
     pub fn read(certificate_file: &Path, key_file: &Path) -> Result<Self, Error> {
         let failed = |file: &Path, error: &dyn std::fmt::Display| Error::Certificate {
             file: file.to_owned(),
@@ -53,6 +54,7 @@ impl Certificate {
         if chain.is_empty() {
             return Err(failed(certificate_file, &"it contains no certificate in PEM format"));
         }
+        check_is_private(key_file, OTHERS)?;
         let key = PrivateKeyDer::from_pem_file(key_file).map_err(|error| failed(key_file, &error))?;
         let certificate = Self { chain, key };
         // Detects a key of another certificate.
@@ -121,12 +123,17 @@ fn create(folder: &Path, file: &Path, pem: &str) -> std::io::Result<()> {
     }
 }
 
+/// Permissions of the group and of all other users.
+const GROUP_AND_OTHERS: u32 = 0o077;
+/// Permissions of all other users.
+const OTHERS: u32 = 0o007;
+
 #[cfg(unix)]
-fn check_is_private(file: &Path) -> Result<(), Error> {
+fn check_is_private(file: &Path, forbidden: u32) -> Result<(), Error> {
     use std::os::unix::fs::PermissionsExt;
     let metadata =
         file.metadata().map_err(|error| Error::Certificate { file: file.to_owned(), reason: error.to_string() })?;
-    if metadata.permissions().mode() & 0o077 == 0 {
+    if metadata.permissions().mode() & forbidden == 0 {
         Ok(())
     } else {
         Err(Error::PublicKeyFile { file: file.to_owned() })
@@ -134,7 +141,7 @@ fn check_is_private(file: &Path) -> Result<(), Error> {
 }
 
 #[cfg(not(unix))]
-fn check_is_private(_: &Path) -> Result<(), Error> {
+fn check_is_private(_: &Path, _: u32) -> Result<(), Error> {
     Ok(())
 }
 
@@ -178,6 +185,7 @@ mod tests {
         let [a, b] = ["a", "b"].map(|name| root.path().join(name).join(FILE));
         Certificate::read(&a, &a).expect("its own key");
         let garbage = root.path().join("garbage");
+        // Only the permissions of a key matter.
         std::fs::write(&garbage, "-----BEGIN CERTIFICATE-----\n!!\n-----END CERTIFICATE-----\n").expect("written");
         for (certificate, key, named) in [
             (&a, &b, &a),
@@ -188,7 +196,13 @@ mod tests {
             let error = Certificate::read(certificate, key).expect_err("unusable").to_string();
             assert!(error.contains(&named.display().to_string()) && !error.contains('\n'), "{error}");
         }
-        std::fs::set_permissions(&b, std::fs::Permissions::from_mode(0o640)).expect("permitted");
+        let set_mode = |mode| std::fs::set_permissions(&b, std::fs::Permissions::from_mode(mode)).expect("permitted");
+        set_mode(0o640);
+        Certificate::read(&b, &b).expect("a group may read the key of the user");
+        set_mode(0o644);
+        let error = Certificate::read(&b, &b).expect_err("everybody can read the key");
+        assert!(matches!(error, Error::PublicKeyFile { .. }), "{error}");
+        set_mode(0o640);
         let error = Certificate::kept_in(b.parent().expect("a folder")).expect_err("readable by the group");
         assert!(matches!(error, Error::PublicKeyFile { .. }) && error.to_string().contains("chmod 600"), "{error}");
     }

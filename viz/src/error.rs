@@ -31,7 +31,7 @@ pub enum Error {
         /// What is wrong with it.
         reason: String,
     },
-    /// Other users can read the private key of the kept certificate.
+    /// Other users can read the private key.
     #[error("other users of this computer can read the private key in {0}: run `chmod 600 {0}`", file.display())]
     PublicKeyFile {
         /// File with the key.

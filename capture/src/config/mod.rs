@@ -109,7 +109,7 @@ impl Rig {
     /// are named relative to this folder.
     #[must_use]
     pub fn urdf_folder(path: &Path) -> Option<PathBuf> {
-        let table: toml::Table = toml::from_str(&std::fs::read_to_string(path).ok()?).ok()?;
+        let table: toml::Table = toml::from_str(&files::read_text(path).ok()?).ok()?;
         let urdf = path.parent().unwrap_or(Path::new("")).join(table.get("arm")?.get("urdf")?.as_str()?);
         std::path::absolute(urdf).ok()?.parent().map(Path::to_owned)
     }
@@ -165,12 +165,12 @@ impl Rig {
     /// If a file cannot be written.
     pub fn write_resolved(&self, folder: &Path) -> std::io::Result<PathBuf> {
         let path = folder.join(drivers::recording::RIG_FILE);
-        std::fs::write(folder.join(drivers::recording::URDF_FILE), &self.arm.urdf_text)?;
-        std::fs::write(&path, self.to_toml())?;
+        files::write(&folder.join(drivers::recording::URDF_FILE), &self.arm.urdf_text)?;
+        files::write(&path, self.to_toml())?;
         Ok(path)
     }
 }
 
 fn read_file(description: &'static str, path: &Path) -> Result<String, ConfigError> {
-    std::fs::read_to_string(path).map_err(|source| ConfigError::Read { description, path: path.to_owned(), source })
+    files::read_text(path).map_err(|source| ConfigError::Read { description, path: path.to_owned(), source })
 }

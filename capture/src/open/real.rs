@@ -122,7 +122,7 @@ fn movable_can_arm(rig: &Rig, motion: &ArmMotion) -> crate::Result<Box<dyn Movab
 #[cfg(target_os = "linux")]
 fn movable_config(rig: &Rig, motion: &ArmMotion) -> crate::Result<MovableArmConfig> {
     let path = &motion.odrive_endpoints;
-    let endpoints = || Endpoints::parse(&std::fs::read_to_string(path)?).map_err(crate::Error::other);
+    let endpoints = || Endpoints::parse(&files::read_text(path.as_ref())?).map_err(crate::Error::other);
     let odrive_endpoints = match path.as_str() {
         "" => None,
         _ => Some(endpoints().with_context(|| format!("arm.motion.odrive_endpoints {path:?}"))?),

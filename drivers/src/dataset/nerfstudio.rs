@@ -29,7 +29,7 @@ const EXTENSIONS: [&str; 3] = ["png", "jpg", "jpeg"];
 pub fn read(path: &Path) -> Result<Dataset, Error> {
     let file = if path.is_file() { path.to_owned() } else { path.join(FILE_NAME) };
     let folder = file.parent().unwrap_or(Path::new(".")).to_owned();
-    let text = std::fs::read_to_string(&file).map_err(|source| Error::Open { path: file.clone(), source })?;
+    let text = files::read_text(&file).map_err(|source| Error::Open { path: file.clone(), source })?;
     let file_error = |reason: String| Error::DatasetFile { path: file.clone(), reason };
     if !text.trim_start().starts_with('{') {
         return Err(file_error("not a recording (.mcap), a dataset folder or a transforms.json".to_owned()));

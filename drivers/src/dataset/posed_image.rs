@@ -6,6 +6,9 @@ use image::{DynamicImage, ImageReader};
 use kinematics::{Intrinsics, Stamp, Transform};
 use std::path::{Path, PathBuf};
 
+/// Maximum size of an image file.
+const MAX_IMAGE_BYTES: u64 = 1 << 30;
+
 /// One posed photo on disk.
 #[derive(Clone, Debug, PartialEq)]
 pub struct DatasetImage {
@@ -109,7 +112,7 @@ pub(super) fn image_size_px(path: &Path) -> Result<[u32; 2], Error> {
 }
 
 fn decode_file(path: &Path) -> Result<DynamicImage, Error> {
-    let bytes = std::fs::read(path).map_err(|source| Error::Open { path: path.to_owned(), source })?;
+    let bytes = files::read(path, MAX_IMAGE_BYTES).map_err(|source| Error::Open { path: path.to_owned(), source })?;
     decode_complete(&bytes, None).map_err(|source| decode_error(path, source))
 }
 

@@ -78,7 +78,7 @@ pub fn read(folder: &Path) -> Result<Dataset, Error> {
 /// Lens parameters of a folder. The caller sets the size to that of each photo.
 fn camera_of(folder: &Path) -> Result<Intrinsics, Error> {
     let path = folder.join(CAMERA_FILE);
-    let numbers = match std::fs::read_to_string(&path) {
+    let numbers = match files::read_text(&path) {
         Ok(text) => camera_numbers(&text).map_err(|reason| Error::DatasetFile { path, reason })?,
         Err(_) => camera_by_name(folder).ok_or_else(|| Error::NoIntrinsics { path: folder.to_owned() })?,
     };
@@ -112,7 +112,7 @@ fn camera_by_name(folder: &Path) -> Option<[f64; 9]> {
 /// Lines of a list, each split into its stamp and the words after it, sorted by time.
 fn stamped_lines(folder: &Path, list: &str) -> Result<Vec<(Stamp, Vec<String>)>, Error> {
     let path = folder.join(list);
-    let text = std::fs::read_to_string(&path).map_err(|source| Error::Open { path: path.clone(), source })?;
+    let text = files::read_text(&path).map_err(|source| Error::Open { path: path.clone(), source })?;
     let mut lines = Vec::new();
     for (line_ix, line) in text.lines().enumerate() {
         let mut words = line.split_whitespace().map(str::to_owned);

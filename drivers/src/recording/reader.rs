@@ -45,7 +45,7 @@ impl Recording {
     /// If the file does not exist, is not an MCAP file, or contains no samples recorded by this program.
     pub fn open(path: &Path) -> Result<Self, Error> {
         let open = |source| Error::Open { path: path.to_owned(), source };
-        let mut file = File::open(path).map_err(open)?;
+        let mut file = files::open(path).map_err(open)?;
         let mut magic = [0; mcap::MAGIC.len()];
         match file.read_exact(&mut magic) {
             Ok(()) if magic == mcap::MAGIC => {}

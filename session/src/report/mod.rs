@@ -415,7 +415,7 @@ pub(crate) fn settings_in(folder: &Path) -> Value {
     let newest = names.filter_map(|entry| Some((step_of(entry.file_name().to_str()?)?, entry.path()))).max();
     let path = newest.map_or_else(|| folder.join("decisions.jsonl"), |(_, path)| path);
     let first_line = || -> Option<Value> {
-        let text = std::fs::read_to_string(&path).ok()?;
+        let text = files::read_text(&path).ok()?;
         serde_json::from_str(text.lines().next()?).ok()
     };
     first_line().unwrap_or_default()

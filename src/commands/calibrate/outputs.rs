@@ -265,5 +265,5 @@ pub(super) fn heading<T>(input: &Path, result: &anyhow::Result<T>, warnings: Vec
 
 /// The contents of a text file; a missing or unreadable file is a bad argument.
 pub(super) fn read_text(path: &Path) -> Result<String, BadArgument> {
-    std::fs::read_to_string(path).map_err(|error| BadArgument(format!("cannot read {}: {error}", path.display())))
+    files::read_text(path).map_err(|error| BadArgument(format!("cannot read {}: {error}", path.display())))
 }

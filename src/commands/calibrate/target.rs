@@ -53,7 +53,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     if let Some(warning) = symmetry_warning(&args.target) {
         log::warn!("{warning}");
     }
-    std::fs::write(&args.out, pdf).with_context(|| format!("cannot write {}", args.out.display()))?;
+    files::write(&args.out, pdf).with_context(|| format!("cannot write {}", args.out.display()))?;
     print::line(format!(
         "{}: print it at 100 % (no scaling), measure the ruler, and fix it to something flat.\nCalibrate with \
          --target {}",

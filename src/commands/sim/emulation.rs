@@ -195,7 +195,7 @@ fn write_rig(folder: &Path, rig: &Rig) -> anyhow::Result<PathBuf> {
     let path = folder.join(drivers::recording::RIG_FILE);
     let urdf = folder.join(drivers::recording::URDF_FILE);
     for (path, text) in [(&path, &rig.to_toml()), (&urdf, &rig.arm.urdf_text)] {
-        std::fs::write(path, text).with_context(|| format!("cannot write {}", path.display()))?;
+        files::write(path, text).with_context(|| format!("cannot write {}", path.display()))?;
     }
     Ok(path)
 }

@@ -109,7 +109,8 @@ impl Edits {
         if !path.is_file() {
             return Ok(Self::default());
         }
-        let bytes = std::fs::read(&path).map_err(|source| Error::Read { path: path.clone(), source })?;
+        let bytes =
+            files::read(&path, files::MAX_TEXT_BYTES).map_err(|source| Error::Read { path: path.clone(), source })?;
         let file: File =
             serde_json::from_slice(&bytes).map_err(|source| Error::ModelMetadata { path: path.clone(), source })?;
         Ok(file.edits)
@@ -130,7 +131,7 @@ impl Edits {
         }
         let text = serde_json::to_string(&File { edits: self.clone() });
         let text = text.map_err(|error| Error::Write { path: path.clone(), source: error.into() })?;
-        crate::atomic_file::write(&path, |file| std::io::Write::write_all(file, format!("{text}\n").as_bytes()))
+        files::write(&path, format!("{text}\n")).map_err(|source| Error::Write { path, source })
     }
 
     /// The data of shared/erased.wgsl, for kernels whose points are in a frame, and in units, other than the world's.

@@ -33,7 +33,8 @@ pub struct Lpips {
 impl Lpips {
     /// Reads the weights: a safetensors file with `features.*` of `SqueezeNet` 1.1 and `lin0..6.weight`.
     pub fn load(path: &Path) -> Result<Self, Error> {
-        let bytes = std::fs::read(path).map_err(|source| Error::Read { path: path.to_owned(), source })?;
+        let bytes =
+            files::read(path, files::NO_LIMIT).map_err(|source| Error::Read { path: path.to_owned(), source })?;
         Self::from_bytes(&bytes).map_err(|source| Error::LpipsWeights { path: path.to_owned(), source })
     }
 

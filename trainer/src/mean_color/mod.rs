@@ -212,7 +212,7 @@ impl Method for MeanColor {
         self.state()?.write(&folder.join(COLOR_FILE))?;
         let description = serde_json::json!({ "method": MeanColorOptions::METHOD, "steps": self.step });
         let path = folder.join(METADATA_FILE);
-        std::fs::write(&path, description.to_string()).map_err(|source| Error::Write { path, source })
+        files::write(&path, description.to_string()).map_err(|source| Error::Write { path, source })
     }
 
     fn checkpoint(&mut self) -> Result<PendingCheckpoint, Error> {

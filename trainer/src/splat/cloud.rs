@@ -98,7 +98,7 @@ pub fn scan_cloud(n_splats: usize, seed: u64) -> SplatArrays {
 /// 3), all f32.
 pub fn load_cloud_npz(path: &Path) -> Result<SplatArrays, Error> {
     let read = || -> io::Result<SplatArrays> {
-        let mut file = ZipArchive::new(BufReader::new(File::open(path)?))?;
+        let mut file = ZipArchive::new(BufReader::new(files::open(path)?))?;
         Ok(SplatArrays {
             means: rows(&mut file, "means", &[3])?,
             log_scales: rows(&mut file, "log_scales", &[3])?,

@@ -434,7 +434,7 @@ impl Method for SplatTrainer {
             "background_srgb": self.background_srgb(),
         });
         let path = folder.join(METADATA_FILE);
-        std::fs::write(&path, format!("{metadata:#}\n")).map_err(|source| Error::Write { path, source })
+        files::write(&path, format!("{metadata:#}\n")).map_err(|source| Error::Write { path, source })
     }
 
     fn checkpoint(&mut self) -> Result<PendingCheckpoint, Error> {

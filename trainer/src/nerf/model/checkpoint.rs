@@ -248,6 +248,6 @@ impl NerfModel {
             "cameras": cameras,
         });
         let path = folder.join(METADATA_FILE);
-        std::fs::write(&path, format!("{description:#}\n")).map_err(|source| write_error(&path, source))
+        files::write(&path, format!("{description:#}\n")).map_err(|source| write_error(&path, source))
     }
 }

@@ -4,8 +4,8 @@
 mod header;
 mod packed;
 
+use crate::Error;
 use crate::splat::arrays::SplatArrays;
-use crate::{Error, atomic_file};
 use header::{Column, Header, Table};
 use std::io::{BufWriter, Write};
 use std::path::Path;
@@ -13,17 +13,18 @@ use std::path::Path;
 /// Reads a `.ply` file of splats. Properties may have any order and number type. The number of `f_rest_*` properties
 /// determines the SH degree.
 pub fn read(path: &Path) -> Result<SplatArrays, Error> {
-    let bytes = std::fs::read(path).map_err(|source| Error::Read { path: path.to_owned(), source })?;
+    let bytes = files::read(path, files::NO_LIMIT).map_err(|source| Error::Read { path: path.to_owned(), source })?;
     from_bytes(&bytes).map_err(|reason| Error::SplatFile { path: path.to_owned(), reason })?.checked()
 }
 
 /// Writes a `.ply` file of splats as little-endian f32. A failed write leaves no partial file at `path`.
 pub fn write(path: &Path, splats: &SplatArrays) -> Result<(), Error> {
-    atomic_file::write(path, |file| {
+    let written = files::replace(path, |file| {
         let mut file = BufWriter::new(file);
         write_to(&mut file, splats)?;
         file.flush()
-    })
+    });
+    written.map_err(|source| Error::Write { path: path.to_owned(), source })
 }
 
 fn from_bytes(bytes: &[u8]) -> Result<SplatArrays, String> {

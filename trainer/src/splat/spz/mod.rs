@@ -10,8 +10,8 @@
 
 mod quantize;
 
+use crate::Error;
 use crate::splat::arrays::SplatArrays;
-use crate::{Error, atomic_file};
 use flate2::Compression;
 use flate2::bufread::GzDecoder;
 use flate2::write::GzEncoder;
@@ -36,7 +36,7 @@ const SH_SIGNS: [f32; 15] = [-1.0, -1.0, 1.0, -1.0, 1.0, 1.0, -1.0, 1.0, -1.0, 1
 
 /// Reads a `.spz` file of splats.
 pub fn read(path: &Path) -> Result<SplatArrays, Error> {
-    let bytes = std::fs::read(path).map_err(|source| Error::Read { path: path.to_owned(), source })?;
+    let bytes = files::read(path, files::NO_LIMIT).map_err(|source| Error::Read { path: path.to_owned(), source })?;
     from_bytes(&bytes).map_err(|reason| Error::SplatFile { path: path.to_owned(), reason })?.checked()
 }
 
@@ -45,11 +45,12 @@ pub fn read(path: &Path) -> Result<SplatArrays, Error> {
 /// Values outside the range of the format are clamped, except for means: coordinates beyond 8388 km are an error.
 pub fn write(path: &Path, splats: &SplatArrays) -> Result<(), Error> {
     let uncompressed = uncompressed_bytes(&splats.clone().checked()?)?;
-    atomic_file::write(path, |file| {
+    let written = files::replace(path, |file| {
         let mut gzip = GzEncoder::new(file, Compression::default());
         gzip.write_all(&uncompressed)?;
         gzip.finish().map(drop)
-    })
+    });
+    written.map_err(|source| Error::Write { path: path.to_owned(), source })
 }
 
 /// The header of a file.

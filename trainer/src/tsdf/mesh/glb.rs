@@ -1,9 +1,8 @@
 //! Meshes as `.glb`: glTF 2.0 (Khronos 2021), one JSON and one binary chunk.
 
 use super::Mesh;
-use crate::{Error, atomic_file};
+use crate::Error;
 use serde_json::json;
-use std::io::Write;
 use std::path::Path;
 
 const MAGIC: u32 = 0x4654_6c67;
@@ -17,7 +16,7 @@ const INDICES: u32 = 34_963;
 /// Writes a mesh. glTF has y up and z toward the viewer, while the world has z up. One node holds that rotation,
 /// another the origin.
 pub fn write(path: &Path, mesh: &Mesh) -> Result<(), Error> {
-    atomic_file::write(path, |file| file.write_all(&to_bytes(mesh)))
+    files::write(path, to_bytes(mesh)).map_err(|source| Error::Write { path: path.to_owned(), source })
 }
 
 /// Encodes the file.

@@ -1,7 +1,7 @@
 //! Meshes as binary `.ply` (Turk 1994), for other programs.
 
 use super::Mesh;
-use crate::{Error, atomic_file};
+use crate::Error;
 use std::io::{BufWriter, Write};
 use std::path::Path;
 
@@ -10,11 +10,12 @@ const FAR_M: f64 = 1000.0;
 
 /// Writes a mesh in world, in meters.
 pub fn write(path: &Path, mesh: &Mesh) -> Result<(), Error> {
-    atomic_file::write(path, |file| {
+    let written = files::replace(path, |file| {
         let mut file = BufWriter::new(file);
         write_to(&mut file, mesh)?;
         file.flush()
-    })
+    });
+    written.map_err(|source| Error::Write { path: path.to_owned(), source })
 }
 
 pub(super) fn write_to(file: &mut impl Write, mesh: &Mesh) -> std::io::Result<()> {

@@ -66,7 +66,7 @@ impl TsdfModel {
             "voxel_grid": self.voxel_grid(),
         });
         let path = folder.join(METADATA_FILE);
-        std::fs::write(&path, format!("{description:#}\n")).map_err(|source| write_error(&path, source))
+        files::write(&path, format!("{description:#}\n")).map_err(|source| write_error(&path, source))
     }
 }
 

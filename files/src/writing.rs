@@ -1,0 +1,301 @@
+//! Writes files so that they are complete or absent, and locks folders.
+
+use crate::partial::{self, Registered};
+use rustix::fs::{CWD, FlockOperation, Mode, OFlags, flock, renameat_with};
+use std::fs::File;
+use std::io::{Error, ErrorKind, Write};
+use std::os::unix::fs::MetadataExt;
+use std::path::{Path, PathBuf};
+
+/// Replaces a file, or writes a new one. A link with this name is replaced, not followed.
+///
+/// # Errors
+/// If the file cannot be written, or another program is writing it; the previous file is kept.
+pub fn replace(path: &Path, contents: impl FnOnce(&mut File) -> std::io::Result<()>) -> std::io::Result<()> {
+    write_and_publish(path, contents, |unfinished| std::fs::rename(unfinished, path))
+}
+
+/// As [`replace`], with contents that are in memory.
+///
+/// # Errors
+/// As [`replace`].
+pub fn write(path: &Path, contents: impl AsRef<[u8]>) -> std::io::Result<()> {
+    replace(path, |file| file.write_all(contents.as_ref()))
+}
+
+/// Starts a file that grows while it is written, such as a log. A file or link with this name is removed first.
+///
+/// # Errors
+/// If the file cannot be created.
+pub fn begin(path: &Path) -> std::io::Result<File> {
+    match std::fs::remove_file(path) {
+        Err(error) if error.kind() != ErrorKind::NotFound => Err(error),
+        _ => File::create_new(path),
+    }
+}
+
+/// Writes a new file.
+///
+/// # Errors
+/// If the file cannot be written, exists already, also as a link, or another program is writing it.
+pub fn create(path: &Path, contents: impl FnOnce(&mut File) -> std::io::Result<()>) -> std::io::Result<()> {
+    if path.symlink_metadata().is_ok() {
+        return Err(exists());
+    }
+    write_and_publish(path, contents, |unfinished| publish(unfinished, path))
+}
+
+/// Writes a new file that `write` puts under the given path, in a temporary folder.
+///
+/// # Errors
+/// The errors of `write`, and those of [`create`].
+pub fn create_from<T, E: From<Error>>(path: &Path, write: impl FnOnce(&Path) -> Result<T, E>) -> Result<T, E> {
+    if path.symlink_metadata().is_ok() {
+        return Err(exists().into());
+    }
+    let unfinished = Unfinished::folder(path)?;
+    let inside = unfinished.path.join(path.file_name().unwrap_or_default());
+    let written = write(&inside)?;
+    publish(&inside, path)?;
+    sync_parent(path)?;
+    Ok(written)
+}
+
+fn exists() -> Error {
+    Error::new(ErrorKind::AlreadyExists, "it exists already")
+}
+
+fn write_and_publish(
+    path: &Path,
+    contents: impl FnOnce(&mut File) -> std::io::Result<()>,
+    publish: impl FnOnce(&Path) -> std::io::Result<()>,
+) -> std::io::Result<()> {
+    let mut unfinished = Unfinished::file(path)?;
+    contents(&mut unfinished.file)?;
+    unfinished.file.sync_all()?;
+    publish(&unfinished.path)?;
+    // From here on, the temporary name may belong to another program.
+    unfinished.registered.disarm();
+    sync_parent(path)
+}
+
+/// Renames a file unless the new name exists.
+fn publish(from: &Path, to: &Path) -> std::io::Result<()> {
+    #[cfg(target_os = "linux")]
+    match renameat_with(CWD, from, CWD, to, rustix::fs::RenameFlags::NOREPLACE) {
+        // Some file systems cannot.
+        Err(rustix::io::Errno::INVAL | rustix::io::Errno::NOSYS) => {}
+        Err(rustix::io::Errno::EXIST) => return Err(exists()),
+        renamed => return Ok(renamed?),
+    }
+    if to.symlink_metadata().is_ok() {
+        return Err(exists());
+    }
+    std::fs::rename(from, to)
+}
+
+/// A rename is durable only after the folder is synced.
+fn sync_parent(path: &Path) -> std::io::Result<()> {
+    let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    match File::open(folder)?.sync_all() {
+        // Some network file systems cannot sync folders.
+        Err(error) if matches!(error.kind(), ErrorKind::InvalidInput | ErrorKind::Unsupported) => Ok(()),
+        synced => synced,
+    }
+}
+
+/// A file or folder with the suffix `.part`, locked by this process; removed on drop if it is still there.
+struct Unfinished {
+    path: PathBuf,
+    /// Removes it; before `file`, so that it is still locked then.
+    registered: Registered,
+    /// The file, or the folder opened for the lock.
+    file: File,
+}
+
+impl Unfinished {
+    fn file(path: &Path) -> std::io::Result<Self> {
+        Self::new(path, |unfinished| File::create_new(unfinished))
+    }
+
+    fn folder(path: &Path) -> std::io::Result<Self> {
+        Self::new(path, |unfinished| {
+            std::fs::create_dir(unfinished)?;
+            File::open(unfinished)
+        })
+    }
+
+    /// Makes and locks the temporary file. One that is left over from a program that was killed is removed before.
+    fn new(path: &Path, make: impl Fn(&Path) -> std::io::Result<File>) -> std::io::Result<Self> {
+        const MAX_ATTEMPTS: usize = 100;
+        let busy = || Error::new(ErrorKind::ResourceBusy, "another program is writing it");
+        let unfinished = partial::path_of(path);
+        for _ in 0..MAX_ATTEMPTS {
+            match make(&unfinished) {
+                Ok(file) => {
+                    // Another program may have taken it for a leftover in between.
+                    if try_lock(&file)? && is_at(&file, &unfinished) {
+                        let registered = Registered::new(&unfinished);
+                        return Ok(Self { path: unfinished, registered, file });
+                    }
+                }
+                Err(error) if error.kind() == ErrorKind::AlreadyExists => {
+                    let flags = OFlags::RDONLY | OFlags::NOFOLLOW | OFlags::NONBLOCK | OFlags::CLOEXEC;
+                    let leftover = rustix::fs::open(&unfinished, flags, Mode::empty()).map(File::from);
+                    // A link and a socket cannot be opened, and are in nobody's use.
+                    if let Ok(leftover) = leftover
+                        && !try_lock(&leftover)?
+                    {
+                        return Err(busy());
+                    }
+                    partial::remove(&unfinished);
+                }
+                Err(error) => return Err(error),
+            }
+        }
+        Err(busy())
+    }
+}
+
+/// Takes the lock of an open file; returns whether it was free. A file system without locks has them all free.
+fn try_lock(file: &File) -> std::io::Result<bool> {
+    match flock(file, FlockOperation::NonBlockingLockExclusive) {
+        Ok(()) | Err(rustix::io::Errno::NOTSUP | rustix::io::Errno::NOLCK) => Ok(true),
+        Err(rustix::io::Errno::WOULDBLOCK) => Ok(false),
+        Err(error) => Err(error.into()),
+    }
+}
+
+fn is_at(file: &File, path: &Path) -> bool {
+    let id = |metadata: std::fs::Metadata| (metadata.dev(), metadata.ino());
+    file.metadata().is_ok_and(|open| path.symlink_metadata().is_ok_and(|named| id(open) == id(named)))
+}
+
+/// Takes the lock of a file, which is created if necessary and keeps its contents. Returns `None` if another program
+/// holds it. The lock is released when the file is closed.
+///
+/// # Errors
+/// If the file cannot be created, or is a link.
+pub fn lock(path: &Path) -> std::io::Result<Option<File>> {
+    let flags = OFlags::RDWR | OFlags::CREATE | OFlags::NOFOLLOW | OFlags::NONBLOCK | OFlags::CLOEXEC;
+    let file = match rustix::fs::open(path, flags, Mode::from_raw_mode(0o666)) {
+        Err(rustix::io::Errno::LOOP) => return Err(Error::new(ErrorKind::InvalidInput, "it is a link")),
+        opened => File::from(opened?),
+    };
+    Ok(try_lock(&file)?.then_some(file))
+}
+
+/// Checks that a folder into which files will be written is not a link. It need not exist.
+///
+/// # Errors
+/// If it is a link.
+pub fn check_no_link(folder: &Path) -> std::io::Result<()> {
+    match std::fs::read_link(folder) {
+        Ok(target) => Err(Error::new(
+            ErrorKind::InvalidInput,
+            format!(
+                "{} is a link to {:?}, and files are not written through links: replace it by the folder itself",
+                folder.display(),
+                target
+            ),
+        )),
+        Err(_) => Ok(()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::os::unix::fs::symlink;
+
+    fn text(text: &str) -> impl FnOnce(&mut File) -> std::io::Result<()> {
+        move |file| file.write_all(text.as_bytes())
+    }
+
+    fn names(folder: &Path) -> Vec<String> {
+        let entries = std::fs::read_dir(folder).expect("a folder");
+        let mut names: Vec<_> =
+            entries.map(|entry| entry.expect("an entry").file_name().to_string_lossy().into_owned()).collect();
+        names.sort();
+        names
+    }
+
+    #[test]
+    fn failed_write_keeps_only_the_previous_file() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("scene.ply");
+        replace(&path, text("first")).expect("written");
+        let failed = replace(&path, |file| {
+            file.write_all(b"sec")?;
+            Err(ErrorKind::StorageFull.into())
+        });
+        assert_eq!(failed.expect_err("the disk is full").kind(), ErrorKind::StorageFull);
+        assert_eq!(create(&path, text("second")).expect_err("it exists").kind(), ErrorKind::AlreadyExists);
+        assert_eq!(std::fs::read(&path).expect("kept"), b"first");
+        assert_eq!(names(folder.path()), ["scene.ply"]);
+    }
+
+    #[test]
+    fn links_are_replaced_and_never_followed() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let at = |name: &str| folder.path().join(name);
+        std::fs::write(at("precious"), "precious").expect("written");
+        std::fs::create_dir(at("elsewhere")).expect("a folder");
+        for (name, target) in
+            [("a", "precious"), ("a.part", "precious"), ("b.part", "elsewhere"), (".lock", "precious")]
+        {
+            symlink(at(target), at(name)).expect("a link");
+        }
+        replace(&at("a"), text("new")).expect("the links are replaced");
+        create_from(&at("b"), |inside| std::fs::write(inside, "new")).expect("the link is replaced");
+        symlink(at("precious"), at("log")).expect("a link");
+        begin(&at("log")).expect("the link is replaced").write_all(b"new").expect("written");
+        assert_eq!(
+            ["a", "b", "precious"].map(|name| std::fs::read_to_string(at(name)).expect("text")),
+            ["new", "new", "precious"]
+        );
+        assert!(!at("a").is_symlink() && names(&at("elsewhere")).is_empty());
+        assert_eq!(lock(&at(".lock")).expect_err("a link").to_string(), "it is a link");
+        symlink(at("elsewhere"), at("keyframes")).expect("a link");
+        assert!(check_no_link(&at("keyframes")).expect_err("a link").to_string().contains("keyframes is a link to"));
+        check_no_link(&at("elsewhere")).expect("a folder");
+        check_no_link(&at("absent")).expect("not there yet");
+    }
+
+    #[test]
+    fn one_of_two_writers_wins_and_leftovers_are_replaced() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("scene.ply");
+        std::fs::write(partial::path_of(&path), "of a program that was killed").expect("written");
+        replace(&path, |file| {
+            // As another program would; locks of one process conflict in the same way.
+            let refused = replace(&path, text("other")).expect_err("it is being written");
+            assert_eq!(refused.to_string(), "another program is writing it");
+            assert_eq!(create(&path, text("other")).expect_err("it is being written").kind(), ErrorKind::ResourceBusy);
+            file.write_all(b"first")
+        })
+        .expect("the first writer wins");
+        assert_eq!(std::fs::read(&path).expect("a file"), b"first");
+        let other = folder.path().join("b.ply");
+        let created = create_from(&other, |inside| -> std::io::Result<u8> {
+            std::fs::write(inside, "late")?;
+            std::fs::write(&other, "early")?; // By a program without locks.
+            Ok(7)
+        });
+        assert_eq!(created.expect_err("it exists").kind(), ErrorKind::AlreadyExists);
+        assert_eq!(std::fs::read(&other).expect("a file"), b"early");
+        assert_eq!(names(folder.path()), ["b.ply", "scene.ply"]);
+    }
+
+    #[test]
+    fn lock_is_exclusive_and_keeps_the_contents() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join(".lock");
+        std::fs::write(&path, "kept").expect("written");
+        let held = lock(&path).expect("a file").expect("nobody holds it");
+        assert!(lock(&path).expect("a file").is_none());
+        drop(held);
+        assert!(lock(&path).expect("a file").is_some());
+        assert_eq!(std::fs::read(&path).expect("a file"), b"kept");
+    }
+}
