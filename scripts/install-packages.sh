@@ -284,12 +284,13 @@ if ! command -v apt-get >/dev/null 2>&1; then
     give_up
 fi
 # If another apt holds the lock, wait for it.
-install="apt-get install -y -q --no-install-recommends -o DPkg::Lock::Timeout=300"
+# It never removes a package of this computer.
+install="apt-get install -y -q --no-install-recommends --no-remove -o DPkg::Lock::Timeout=300"
 # After `;`, the installation continues even if a repository is unreachable.
 line="apt-get update -q; $install$missing"
 # An interrupted installation must be finished first, together with its dependencies.
 if [ -n "$(dpkg --audit 2>/dev/null)" ]; then
-    line="dpkg --configure -a; apt-get update -q; $install --fix-broken --no-remove; $install$missing"
+    line="dpkg --configure -a; apt-get update -q; $install --fix-broken; $install$missing"
 fi
 if [ "$(id -u)" -ne 0 ]; then
     echo "not running as root; run this command, then try again:" >&2
@@ -304,7 +305,8 @@ echo "installing:$missing" >&2
 export DEBIAN_FRONTEND=noninteractive
 requested=$missing
 if ! sh -c "$line" >&2; then
-    echo "apt-get could not install all of$requested; see its message above" >&2
+    echo "apt-get could not install all of$requested; see its message above. If packages would be removed, they conflict with" >&2
+    echo "installed ones: upgrade or remove those yourself, then try again" >&2
     give_up
 fi
 hash -r

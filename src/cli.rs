@@ -23,7 +23,7 @@ pub(crate) struct Cli {
     /// Log debug messages on stderr; repeat to log everything
     #[arg(short, long, global = true, action = ArgAction::Count)]
     pub(crate) verbose: u8,
-    /// Let other users of this computer read what `run`, `record` and `train` write, as the umask allows
+    /// With `run`, `record` and `train`: create files with the permissions of your umask, instead of only for you
     #[arg(long, global = true)]
     pub(crate) public_files: bool,
     #[command(subcommand)]

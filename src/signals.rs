@@ -1,7 +1,7 @@
 //! Signals that end a command: it stops, saves, and exits.
 //!
 //! SIGINT (Ctrl-C), SIGTERM and SIGHUP (the terminal was closed) request an orderly stop. A second Ctrl-C ends the
-//! process at once; arms with CAN motors get their fail-safe command before that. SIGHUP never does, because closing a
+//! process at once, and so does SIGQUIT; arms with CAN motors get their fail-safe command before that. SIGHUP never ends the process at once, because closing a
 //! terminal sends it more than once: from the kernel to the foreground group, and from the shell to its jobs. If SIGHUP
 //! is ignored, as under `nohup`, it stays ignored.
 
@@ -10,7 +10,7 @@ use capture::Stop;
 use files::partial;
 use rustix::event::{PollFd, PollFlags, poll};
 use rustix::io::Errno;
-use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
+use signal_hook::consts::{SIGHUP, SIGINT, SIGQUIT, SIGTERM};
 use signal_hook::iterator::Signals;
 use signal_hook::low_level;
 use std::os::fd::AsFd;
@@ -30,10 +30,14 @@ pub(crate) fn stop_on_signals() -> anyhow::Result<Stop> {
 /// As [`stop_on_signals`], for a command that saves nothing.
 pub(crate) fn stop_on_signals_logging(message: &'static str) -> anyhow::Result<Stop> {
     let (stop, [signaled, interrupted]) = Stop::with_signal_flags(message);
-    let mut signals = Signals::new(termination_signals()).context("cannot install signal handlers")?;
+    let mut signals = Signals::new(termination_signals().chain([SIGQUIT])).context("cannot install signal handlers")?;
     let mut interrupted_at = Instant::now();
     let take_signals = move || {
         for signal in signals.forever() {
+            if signal == SIGQUIT {
+                drivers::motion::apply_fail_safe();
+                let _ = low_level::emulate_default_handler(SIGQUIT); // It does not return.
+            }
             if signal == SIGINT {
                 if !interrupted.swap(true, Ordering::Relaxed) {
                     interrupted_at = Instant::now();
@@ -49,8 +53,8 @@ pub(crate) fn stop_on_signals_logging(message: &'static str) -> anyhow::Result<S
     Ok(stop)
 }
 
-/// Requests a stop when stdout or stderr is closed, because nobody supervises the command any more: a terminal without
-/// SIGHUP, or the reader of a pipe. At most once per process.
+/// Requests a stop when stdout or stderr is closed, for example because a terminal closed without sending SIGHUP, or the
+/// reader of a pipe ended. Nobody then supervises the motion. At most once per process.
 pub(crate) fn stop_when_output_closes(stop: &Stop) -> anyhow::Result<()> {
     let stop = stop.clone();
     let watch = move || {

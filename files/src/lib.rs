@@ -1,9 +1,11 @@
 //! Reads and writes the files of users, with the same guards everywhere.
 //!
-//! - Only regular files are read, of at most a given size. A pipe would wait forever, and a device has no end.
-//! - Files are written under a temporary name and then renamed, so that they are complete or absent. Links are never
-//!   followed: neither the temporary name nor the final one can lead to another place.
-//! - If two programs write the same file, one of them gets an error, and the file of the other is kept.
+//! - Only regular files are read, of at most a given size. Opening a pipe may block forever, and a device may have no end.
+//! - Whole files are written under a temporary name and then renamed, so that they are complete or absent. [`begin`] is the
+//!   exception: it starts a growing log under its final name.
+//! - Symbolic links are followed when reading, but neither the temporary nor the final name of an output is followed.
+//! - Of two programs that write the same file at the same time, the second gets an error, if the file system supports
+//!   locks.
 
 pub mod partial;
 mod reading;

@@ -1,6 +1,6 @@
 //! Removes output files and folders that were not written completely.
 //!
-//! A [`Partial`] removes its folder after an error or a signal, unless [`Partial::keep`] was called. Unfinished files of
+//! A [`Partial`] removes what was created after an error or a signal, unless [`Partial::keep`] was called. Unfinished files of
 //! [`create`](crate::create) and [`replace`](crate::replace) are removed in the same way.
 
 use parking_lot::{Mutex, MutexGuard};

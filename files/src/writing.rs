@@ -37,7 +37,7 @@ pub fn begin(path: &Path) -> std::io::Result<File> {
 /// Writes a new file.
 ///
 /// # Errors
-/// If the file cannot be written, exists already, also as a link, or another program is writing it.
+/// If the file cannot be written, a file or symbolic link with this name exists, or another program is writing it.
 pub fn create(path: &Path, contents: impl FnOnce(&mut File) -> std::io::Result<()>) -> std::io::Result<()> {
     if path.symlink_metadata().is_ok() {
         return Err(exists());
@@ -45,7 +45,7 @@ pub fn create(path: &Path, contents: impl FnOnce(&mut File) -> std::io::Result<(
     write_and_publish(path, contents, |unfinished| publish(unfinished, path))
 }
 
-/// Writes a new file that `write` puts under the given path, in a temporary folder.
+/// Calls `write` with a path in a temporary folder, then moves the result to `path`.
 ///
 /// # Errors
 /// The errors of `write`, and those of [`create`].
@@ -83,7 +83,7 @@ fn write_and_publish(
 fn publish(from: &Path, to: &Path) -> std::io::Result<()> {
     #[cfg(target_os = "linux")]
     match renameat_with(CWD, from, CWD, to, rustix::fs::RenameFlags::NOREPLACE) {
-        // Some file systems cannot.
+        // Some file systems do not support this flag.
         Err(rustix::io::Errno::INVAL | rustix::io::Errno::NOSYS) => {}
         Err(rustix::io::Errno::EXIST) => return Err(exists()),
         renamed => return Ok(renamed?),
@@ -107,7 +107,7 @@ fn sync_parent(path: &Path) -> std::io::Result<()> {
 /// A file or folder with the suffix `.part`, locked by this process; removed on drop if it is still there.
 struct Unfinished {
     path: PathBuf,
-    /// Removes it; before `file`, so that it is still locked then.
+    /// Declared before `file`: fields drop in order, so the path is removed while it is still locked.
     registered: Registered,
     /// The file, or the folder opened for the lock.
     file: File,
@@ -125,7 +125,7 @@ impl Unfinished {
         })
     }
 
-    /// Makes and locks the temporary file. One that is left over from a program that was killed is removed before.
+    /// Makes and locks the temporary file. One that is left over from a program that was killed is removed first.
     fn new(path: &Path, make: impl Fn(&Path) -> std::io::Result<File>) -> std::io::Result<Self> {
         const MAX_ATTEMPTS: usize = 100;
         let busy = || Error::new(ErrorKind::ResourceBusy, "another program is writing it");
@@ -133,7 +133,7 @@ impl Unfinished {
         for _ in 0..MAX_ATTEMPTS {
             match make(&unfinished) {
                 Ok(file) => {
-                    // Another program may have taken it for a leftover in between.
+                    // Another program may have mistaken it for a leftover and removed it before it was locked.
                     if try_lock(&file)? && is_at(&file, &unfinished) {
                         let registered = Registered::new(&unfinished);
                         return Ok(Self { path: unfinished, registered, file });
@@ -142,12 +142,13 @@ impl Unfinished {
                 Err(error) if error.kind() == ErrorKind::AlreadyExists => {
                     let flags = OFlags::RDONLY | OFlags::NOFOLLOW | OFlags::NONBLOCK | OFlags::CLOEXEC;
                     let leftover = rustix::fs::open(&unfinished, flags, Mode::empty()).map(File::from);
-                    // A link and a socket cannot be opened, and are in nobody's use.
+                    // A symbolic link and a socket cannot be opened, and no program is writing them.
                     if let Ok(leftover) = leftover
                         && !try_lock(&leftover)?
                     {
                         return Err(busy());
                     }
+                    check_is_leftover(&unfinished, path)?;
                     partial::remove(&unfinished);
                 }
                 Err(error) => return Err(error),
@@ -157,7 +158,23 @@ impl Unfinished {
     }
 }
 
-/// Takes the lock of an open file; returns whether it was free. A file system without locks has them all free.
+/// Checks that a folder with a temporary name contains nothing but the file that was to be written.
+fn check_is_leftover(unfinished: &Path, path: &Path) -> std::io::Result<()> {
+    if !unfinished.symlink_metadata()?.is_dir() {
+        return Ok(());
+    }
+    let inside = unfinished.join(path.file_name().unwrap_or_default());
+    let own = [partial::path_of(&inside), inside];
+    match std::fs::read_dir(unfinished)?.flatten().find(|entry| !own.contains(&entry.path())) {
+        None => Ok(()),
+        Some(_) => Err(Error::new(
+            ErrorKind::AlreadyExists,
+            format!("{} is a folder with other files; remove it, or choose another name", unfinished.display()),
+        )),
+    }
+}
+
+/// Takes the lock of an open file; returns whether it was free. On a file system without locks, always returns true.
 fn try_lock(file: &File) -> std::io::Result<bool> {
     match flock(file, FlockOperation::NonBlockingLockExclusive) {
         Ok(()) | Err(rustix::io::Errno::NOTSUP | rustix::io::Errno::NOLCK) => Ok(true),
@@ -175,26 +192,26 @@ fn is_at(file: &File, path: &Path) -> bool {
 /// holds it. The lock is released when the file is closed.
 ///
 /// # Errors
-/// If the file cannot be created, or is a link.
+/// If the file cannot be created, or is a symbolic link.
 pub fn lock(path: &Path) -> std::io::Result<Option<File>> {
     let flags = OFlags::RDWR | OFlags::CREATE | OFlags::NOFOLLOW | OFlags::NONBLOCK | OFlags::CLOEXEC;
     let file = match rustix::fs::open(path, flags, Mode::from_raw_mode(0o666)) {
-        Err(rustix::io::Errno::LOOP) => return Err(Error::new(ErrorKind::InvalidInput, "it is a link")),
+        Err(rustix::io::Errno::LOOP) => return Err(Error::new(ErrorKind::InvalidInput, "it is a symbolic link")),
         opened => File::from(opened?),
     };
     Ok(try_lock(&file)?.then_some(file))
 }
 
-/// Checks that a folder into which files will be written is not a link. It need not exist.
+/// Checks that a folder into which files will be written is not a symbolic link. It need not exist.
 ///
 /// # Errors
-/// If it is a link.
+/// If it is a symbolic link.
 pub fn check_no_link(folder: &Path) -> std::io::Result<()> {
     match std::fs::read_link(folder) {
         Ok(target) => Err(Error::new(
             ErrorKind::InvalidInput,
             format!(
-                "{} is a link to {:?}, and files are not written through links: replace it by the folder itself",
+                "{} is a symbolic link to {:?}, and files are not written through symbolic links: replace it with the folder",
                 folder.display(),
                 target
             ),
@@ -255,9 +272,14 @@ mod tests {
             ["new", "new", "precious"]
         );
         assert!(!at("a").is_symlink() && names(&at("elsewhere")).is_empty());
-        assert_eq!(lock(&at(".lock")).expect_err("a link").to_string(), "it is a link");
+        assert_eq!(lock(&at(".lock")).expect_err("a link").to_string(), "it is a symbolic link");
         symlink(at("elsewhere"), at("keyframes")).expect("a link");
-        assert!(check_no_link(&at("keyframes")).expect_err("a link").to_string().contains("keyframes is a link to"));
+        assert!(
+            check_no_link(&at("keyframes"))
+                .expect_err("a link")
+                .to_string()
+                .contains("keyframes is a symbolic link to")
+        );
         check_no_link(&at("elsewhere")).expect("a folder");
         check_no_link(&at("absent")).expect("not there yet");
     }
@@ -285,6 +307,19 @@ mod tests {
         assert_eq!(created.expect_err("it exists").kind(), ErrorKind::AlreadyExists);
         assert_eq!(std::fs::read(&other).expect("a file"), b"early");
         assert_eq!(names(folder.path()), ["b.ply", "scene.ply"]);
+    }
+
+    #[test]
+    fn only_leftovers_are_removed() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let (path, part) = (folder.path().join("a.ply"), folder.path().join("a.ply.part"));
+        std::fs::create_dir(&part).expect("a folder");
+        std::fs::write(part.join("notes.txt"), "of the user").expect("written");
+        let refused = replace(&path, text("new")).expect_err("the folder may not be removed").to_string();
+        assert!(refused.contains("a.ply.part is a folder with other files"), "{refused}");
+        std::fs::rename(part.join("notes.txt"), part.join("a.ply")).expect("renamed");
+        replace(&path, text("new")).expect("the folder is a leftover");
+        assert_eq!(names(folder.path()), ["a.ply"]);
     }
 
     #[test]

@@ -3,8 +3,10 @@
 use crate::print;
 use anyhow::{Context, bail};
 use image::DynamicImage;
+use image::ImageReader;
 use serde::Serialize;
 use session::evaluate::load_lpips;
+use std::io::BufReader;
 use std::path::{Path, PathBuf};
 use trainer::eval::{PixelPair, depth_rmse_m, psnr, ssim};
 
@@ -70,7 +72,7 @@ pub(crate) fn run(args: Args) -> anyhow::Result<()> {
 }
 
 fn open(path: &Path) -> anyhow::Result<DynamicImage> {
-    let read = || anyhow::Ok(image::ImageReader::open(path)?.with_guessed_format()?.decode()?);
+    let read = || anyhow::Ok(ImageReader::new(BufReader::new(files::open(path)?)).with_guessed_format()?.decode()?);
     read().with_context(|| format!("cannot read the image {}", path.display()))
 }
 

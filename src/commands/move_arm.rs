@@ -67,7 +67,7 @@ struct ArrivedEvent<'a> {
 
 /// Moves the arm, then holds it if its motors would release it on exit.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
-    let stop = signals::stop_on_signals_logging("stopping the arm; Ctrl-C again ends the program at once")?;
+    let stop = signals::stop_on_signals_logging("bringing the arm to rest; Ctrl-C again applies on_loss at once")?;
     signals::stop_when_output_closes(&stop)?;
     let rig = Rig::load(&args.rig_file, &[])?;
     let motion = motion_of(&rig)?;
@@ -121,6 +121,9 @@ fn check(args: &Args, rig: &Rig) -> Result<(), BadArgument> {
     if let Some(to) = args.to.as_ref().filter(|to| to.len() != joints.len()) {
         let (n, names) = (to.len(), joints.join(", "));
         return Err(BadArgument(format!("--to has {n} positions, the arm has {} joints: {names}", joints.len())));
+    }
+    if let Some(joint) = joints.iter().find(|joint| args.by.iter().filter(|(by, _)| by == *joint).count() > 1) {
+        return Err(BadArgument(format!("--by: joint {joint:?} is given twice")));
     }
     if let Some((joint, _)) = args.by.iter().find(|(joint, _)| !joints.contains(joint)) {
         let available = if joints.is_empty() { "none".to_owned() } else { joints.join(", ") };

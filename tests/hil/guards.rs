@@ -1,6 +1,6 @@
 //! Guards of a moving arm, inside the virtual kernel: an obstacle, a second program, a panic of the arm's thread, a
-//! second Ctrl-C, and a closed terminal. Each is tried `FIELDRIG_TRIALS` times, 3 by default, at different times of the
-//! motion.
+//! second Ctrl-C, and a closed terminal. The tests of the obstacle, the panic, Ctrl-C and the closed output repeat the
+//! fault `FIELDRIG_TRIALS` times, 3 by default, at different times of the motion.
 
 use crate::can::{Wire, all_families, damiao};
 use crate::can_motion::{MotorObservation, Motors, motors_with_watchdog, movable, wait_until_stopped};
@@ -32,7 +32,7 @@ fn is_moving(observed: &[MotorObservation]) -> bool {
     observed.iter().all(|observed| observed.state == State::Enabled && observed.velocity_rad_s.abs() > 0.1)
 }
 
-/// A time into the motion that differs from trial to trial.
+/// Waits for a time that differs between trials.
 fn wait_for_trial(trial: u64) {
     std::thread::sleep(Duration::from_millis(37 * trial % 400));
 }
@@ -68,7 +68,7 @@ fn obstacle_stops_the_arm() {
     }
     drop(arm);
 
-    // The effort of an MIT motor follows from its stiffness: 30 N m / rad and 1.5 N m are 0.05 rad.
+    // At 30 N m / rad, the effort reaches 1.5 N m at an error of 0.05 rad.
     let limited = |config: &MotorConfig| {
         let mut config = config.clone();
         config.following.max_effort_nm = Some(1.5);
@@ -180,7 +180,7 @@ fn closed_output_stops_the_motion() {
     }
 }
 
-/// Whether all motors execute a command without stiffness, as after the fail-safe `damp`.
+/// Whether all motors execute a command without stiffness, as after the fail-safe command `damp`.
 fn is_damped(observed: &[MotorObservation]) -> bool {
     observed
         .iter()

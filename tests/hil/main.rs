@@ -5,8 +5,8 @@
 //! reads its console. Inside, the same program runs the tests of the other files, which are ignored on the host:
 //! `kvaser.rs` in QEMU, the others in User-Mode Linux.
 //!
-//! User-Mode Linux has a simulated clock (`time-travel=inf-cpu`), so that no result depends on the speed of the host:
-//! computing takes no time, and sleeping takes exactly as long as requested, without waiting. QEMU runs in real time.
+//! User-Mode Linux uses a simulated clock (`time-travel=inf-cpu`): it advances only while all processes sleep, and then
+//! jumps to the next timer. Simulated time therefore does not depend on the host. QEMU runs in real time.
 
 #![expect(clippy::print_stdout, reason = "tests report results from the virtual kernel")]
 
@@ -64,10 +64,10 @@ const BUILD_FILES: [&str; 6] = [
 /// Printed on the console if all tests inside have passed.
 const PASSED: &str = "hil: exit 0";
 
-/// Guard against a machine that hangs. All tests inside take about a minute on an idle host.
+/// Time limit for a virtual machine that hangs. All tests inside take about a minute on an idle host.
 const MAX_RUN: Duration = Duration::from_secs(420);
 
-/// Both machines run on the same processor.
+/// The machines must not compete for a processor.
 static ONE_AT_A_TIME: Mutex<()> = Mutex::new(());
 
 #[test]

@@ -17,7 +17,7 @@ const ALLOWED: [(&str, &[&str]); 15] = [
     ("test-support", &[]),
     ("capture", &["calibration", "drivers", "files", "keyframe", "kinematics", "sim"]),
     ("trainer", &["calibration", "files", "keyframe", "kinematics"]),
-    ("viz", &["keyframe", "kinematics", "trainer"]),
+    ("viz", &["files", "keyframe", "kinematics", "trainer"]),
     ("session", &["calibration", "capture", "drivers", "files", "keyframe", "kinematics", "trainer", "viz"]),
     ("bench", &["calibration", "capture", "files", "keyframe", "kinematics", "session", "trainer"]),
     (

@@ -61,7 +61,7 @@ fn links_in_a_received_run_are_not_followed() {
         let resumed = run(folder, &["train", "data", "--resume", "run", "--steps", &n_steps]);
         let printed = text(&resumed);
         if is_folder || name == ".lock" {
-            assert!(printed.contains("is a link"), "{name}: {printed}");
+            assert!(printed.contains("is a symbolic link"), "{name}: {printed}");
             std::fs::remove_file(&link).unwrap();
         } else {
             assert!(resumed.status.success(), "{name}: {printed}");
@@ -137,9 +137,18 @@ fn pipes_and_devices_are_refused_as_inputs() {
             let _ = std::fs::remove_file(folder.join(name));
             symlink(folder.join(special), folder.join(name)).unwrap();
         };
-        for name in
-            ["rig.toml", "robot.urdf", "path.json", "list.txt", "scan.mcap", "other.ply", "other.spz", "samples.json"]
-        {
+        for name in [
+            "rig.toml",
+            "robot.urdf",
+            "path.json",
+            "list.txt",
+            "scan.mcap",
+            "other.ply",
+            "other.spz",
+            "samples.json",
+            "a.png",
+            "a.pem",
+        ] {
             link(name);
         }
         link("run/model.json");
@@ -155,6 +164,8 @@ fn pipes_and_devices_are_refused_as_inputs() {
             &["export", "other.spz", "--to", "ply", "--out", "new.ply"],
             &["export", "run", "--to", "spz", "--out", "new.spz"],
             &["calibrate", "hand-eye", "samples.json"],
+            &["metrics", "a.png", "a.png"],
+            &["view", "scene.ply", "--listen", "0.0.0.0:0", "--share", "--certificate", "a.pem"],
         ] {
             let refused = run(folder, args);
             let printed = text(&refused);

@@ -48,14 +48,15 @@ impl Certificate {
             file: file.to_owned(),
             reason: error.to_string(),
         };
-        let chain = CertificateDer::pem_file_iter(certificate_file)
-            .and_then(Iterator::collect::<Result<Vec<_>, _>>)
+        let read = |file: &Path| files::read(file, files::MAX_TEXT_BYTES).map_err(|error| failed(file, &error));
+        let chain = CertificateDer::pem_slice_iter(&read(certificate_file)?)
+            .collect::<Result<Vec<_>, _>>()
             .map_err(|error| failed(certificate_file, &error))?;
         if chain.is_empty() {
             return Err(failed(certificate_file, &"it contains no certificate in PEM format"));
         }
         check_is_private(key_file, OTHERS)?;
-        let key = PrivateKeyDer::from_pem_file(key_file).map_err(|error| failed(key_file, &error))?;
+        let key = PrivateKeyDer::from_pem_slice(&read(key_file)?).map_err(|error| failed(key_file, &error))?;
         let certificate = Self { chain, key };
         // Detects a key of another certificate.
         certificate.server_config().map_err(|error| failed(certificate_file, &error))?;

@@ -191,7 +191,9 @@ impl Join {
                     Err(JointsRejection::Invalid) => self.counts.joints_rejected += 1,
                     Err(JointsRejection::TooFast(jump)) => {
                         if self.counts.joints_too_fast == 0 {
-                            log::warn!("joint states are ignored: {jump}; does another program send them, too?");
+                            log::warn!(
+                                "ignored a joint state: {jump}; stop other programs that send joint states, or correct the URDF"
+                            );
                         }
                         self.counts.joints_too_fast += 1;
                     }

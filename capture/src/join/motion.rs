@@ -5,8 +5,10 @@ use crate::config::{self, BaseDriver, Parent, Rig};
 use crate::error::Context;
 use drivers::BasePose;
 use keyframe::BaseState;
+use kinematics::urdf::JointLimits;
 use kinematics::{Chain, HistoryError, Intrinsics, JointHistory, JointState, PoseHistory, Stamp, Transform, Twist};
 use nalgebra::Vector3;
+use std::f64::consts::TAU;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -15,11 +17,13 @@ const MAX_READINGS: usize = 20_000;
 /// Tolerance for joint positions beyond the limits, radians or meters. Calibration errors and soft stops stay within
 /// it.
 const MAX_LIMIT_EXCESS: f64 = 0.2;
-/// Readings that differ by more than this multiple of the joint's speed limit are not from this arm. An arm that is
-/// pushed, or whose description has a limit for slow operation, stays below.
+/// Joint states that imply more than this multiple of a joint's speed limit are ignored as states of another arm. The
+/// margin allows for an arm that is pushed, and for a URDF with reduced limits.
 const MAX_SPEED_FACTOR: f64 = 3.0;
 /// Added to the time between two readings, because their stamps may be inaccurate.
 const MAX_STAMP_ERROR_SECS: f64 = 0.02;
+/// So many ignored states in a row that agree with each other are accepted.
+const MIN_CONSISTENT: u32 = 5;
 /// Maximum gap for interpolating base poses from tags, in image periods. It lets one image in between lack a pose.
 const MAX_IMAGE_INTERVALS: f64 = 2.5;
 
@@ -31,7 +35,16 @@ pub(crate) struct Motion {
     /// Offset added to the reading of each chain joint.
     offsets: Vec<f64>,
     joints: JointHistory,
+    /// The last joint state that was ignored because of its speed, and how many such states in a row agree.
+    ignored: Option<(JointState, u32)>,
     base: BaseMotion,
+}
+
+/// Distance that a joint moved. A joint without limits may report angles that wrap around.
+fn distance(from: f64, to: f64, limits: &JointLimits) -> f64 {
+    let moved = to - from;
+    let n_turns = if limits.lower.is_finite() { 0.0 } else { (moved / TAU).round() };
+    (moved - n_turns * TAU).abs()
 }
 
 /// Why a joint reading was ignored.
@@ -39,7 +52,7 @@ pub(crate) struct Motion {
 pub(crate) enum JointsRejection {
     /// It is out of order or not finite, or has the wrong number of joints.
     Invalid,
-    /// A joint would have moved much faster than it can; the description says which.
+    /// A joint moved faster than possible; the text names the joint.
     TooFast(String),
 }
 
@@ -92,7 +105,7 @@ impl Motion {
             }
         };
         let offsets = order.iter().map(|ix| rig.arm.joint_offsets.get(*ix).copied().unwrap_or(0.0)).collect();
-        Ok(Self { chain, order, offsets, joints: JointHistory::new(max_gap, MAX_READINGS), base })
+        Ok(Self { chain, order, offsets, joints: JointHistory::new(max_gap, MAX_READINGS), ignored: None, base })
     }
 
     /// A warning for the first joint whose reading lies outside its limits in the URDF.
@@ -115,7 +128,7 @@ impl Motion {
     /// Adds joint readings in the order of the device.
     ///
     /// # Errors
-    /// If they are not valid, or cannot follow the previous ones. They are then ignored.
+    /// If they are not valid, or imply an impossible speed. They are then ignored.
     pub(crate) fn push_joints(&mut self, state: JointState) -> Result<(), JointsRejection> {
         let ordered = |numbers: &[f64]| -> Option<Vec<f64>> {
             if numbers.is_empty() {
@@ -130,15 +143,22 @@ impl Motion {
             }
             _ => return Err(JointsRejection::Invalid),
         };
-        if let Some(jump) = self.jump(&state) {
-            return Err(JointsRejection::TooFast(jump));
+        let newest = self.joints.newest().and_then(|newest| self.joints.at(newest).ok());
+        if let Some(jump) = newest.and_then(|newest| self.jump(&newest, &state)) {
+            // If the states stay there, the last accepted state was the wrong one.
+            let continues = self.ignored.as_ref().is_some_and(|(ignored, _)| self.jump(ignored, &state).is_none());
+            let n_ignored = 1 + self.ignored.as_ref().filter(|_| continues).map_or(0, |(_, n_ignored)| *n_ignored);
+            if n_ignored < MIN_CONSISTENT {
+                self.ignored = Some((state, n_ignored));
+                return Err(JointsRejection::TooFast(jump));
+            }
         }
+        self.ignored = None;
         self.joints.push(state).map_err(|_| JointsRejection::Invalid)
     }
 
-    /// Describes the first joint that cannot have moved to this position since the previous reading.
-    fn jump(&self, state: &JointState) -> Option<String> {
-        let before = self.joints.newest().and_then(|newest| self.joints.at(newest).ok())?;
+    /// Describes the first joint that cannot have moved from one state to the other.
+    fn jump(&self, before: &JointState, state: &JointState) -> Option<String> {
         let secs = state.stamp.secs_since(before.stamp);
         if secs <= 0.0 {
             return None; // It is out of order.
@@ -147,12 +167,13 @@ impl Motion {
         let mut joints = joints.zip(before.position.iter().zip(&state.position));
         let ((name, limits), (from, to)) = joints.find(|((_, limits), (from, to))| {
             let max_speed = MAX_SPEED_FACTOR * limits.velocity;
-            max_speed > 0.0 && (*to - *from).abs() > max_speed * (secs + MAX_STAMP_ERROR_SECS)
+            max_speed > 0.0 && distance(**from, **to, limits) > max_speed * (secs + MAX_STAMP_ERROR_SECS)
         })?;
         Some(format!(
-            "joint {name:?} jumps from {from:.3} to {to:.3} within {:.0} ms, but its speed limit is {:.2} per second",
+            "joint {name:?} moved from {from:.3} to {to:.3} in {:.0} ms, at most {:.2} rad/s or m/s are accepted ({MAX_SPEED_FACTOR} \
+             times its limit in the URDF)",
             1e3 * secs,
-            limits.velocity
+            MAX_SPEED_FACTOR * limits.velocity
         ))
     }
 

@@ -362,6 +362,18 @@ fn joint_states_that_jump_are_ignored_and_counted_as_loss() {
 }
 
 #[test]
+fn a_wrong_first_joint_state_is_given_up_after_five_others() {
+    let rig = rig(&[]);
+    let mut wrong_first = samples(1);
+    if let Some(Sample::Joints(state)) = wrong_first.first_mut() {
+        state.position[0] += 2.0;
+    }
+    let mut join = join(&rig);
+    run_join(&mut join, wrong_first);
+    assert_eq!((join.counts().joints_too_fast, join.counts().joints_rejected), (4, 0));
+}
+
+#[test]
 fn moving_base_carries_cameras_and_bad_pose_is_rejected() {
     let rig = rig(&[Override::new("base.driver", "udp"), Override::new("join.max_gap_millis", 150)]);
     let base = |nanos: i64, x_m: f64| {

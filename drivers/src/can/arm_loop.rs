@@ -5,7 +5,7 @@
 //! computer stalls for so long that the watchdogs of the motors have expired or are about to. After that, it discards
 //! earlier setpoints and sends no new ones until it receives [`Request::Recover`].
 //!
-//! It sends the motors their fail-safe command however it ends, also by a panic.
+//! It sends the fail-safe command before it ends, even if it panics.
 
 use super::bus::Bus;
 use super::config::MovableArmConfig;
@@ -133,7 +133,7 @@ impl ArmLoop {
         })
     }
 
-    /// Runs until the owner drops the arm, or the program ends without an orderly stop.
+    /// Runs until the owner drops the arm, or [`apply_fail_safe`](crate::motion::apply_fail_safe) is called.
     pub(super) fn run(mut self) {
         let mut next_cycle = clock::now();
         let mut shutdown_deadline = None;
@@ -416,7 +416,7 @@ impl ArmLoop {
         self.finish_fail_safe();
     }
 
-    /// Resends the fail-safe command until all motors that may not have received it have answered, or for a limited time.
+    /// Resends the fail-safe command to motors without a watchdog until each has answered, or a time limit expires.
     fn finish_fail_safe(&mut self) {
         while let ArmState::Stopped { pending_fail_safe: Some(_), .. } = self.arm_state {
             std::thread::sleep(self.plan.period);

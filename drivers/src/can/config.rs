@@ -69,7 +69,7 @@ pub struct MotorConfig {
     pub offset_rad: f64,
     /// Gains for families whose commands include them (MIT mode); `None` if the motor is only read.
     pub gains: Option<Gains>,
-    /// When the moving arm stops because this joint does not follow its commands.
+    /// Following limits of this joint.
     pub following: FollowingLimits,
 }
 
@@ -93,14 +93,14 @@ pub struct Gains {
     pub damping_nm_s_rad: f64,
 }
 
-/// Limits of a joint that is held by an obstacle or a person. Beyond them, the arm stops.
+/// Limits beyond which a joint counts as blocked, and the arm stops.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct FollowingLimits {
     /// Following error: largest difference between the commanded and the reported position, rad or m.
     pub max_error_rad: f64,
     /// Largest effort that the motor may report, N m or N at the joint; `None` if it is not limited.
     pub max_effort_nm: Option<f64>,
-    /// Move the joint without these limits.
+    /// Whether these limits are disabled.
     pub is_off: bool,
 }
 
@@ -111,7 +111,7 @@ impl Default for FollowingLimits {
 }
 
 impl FollowingLimits {
-    /// Why the joint counts as held; `None` if it follows its commands.
+    /// Describes the exceeded limit; `None` if there is none.
     pub(super) fn violation(&self, commanded_rad: f64, position_rad: f64, effort_nm: Option<f64>) -> Option<String> {
         if self.is_off {
             return None;
@@ -136,7 +136,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn joint_is_held_beyond_either_limit() {
+    fn joint_is_blocked_beyond_either_limit() {
         let limits = FollowingLimits { max_error_rad: 0.1, max_effort_nm: Some(4.0), is_off: false };
         assert_eq!(limits.violation(0.5, 0.41, Some(-3.9)), None);
         let error = limits.violation(0.5, 0.39, None).expect("the position is too far");

@@ -117,7 +117,7 @@ fn decode_file(path: &Path) -> Result<DynamicImage, Error> {
 }
 
 fn open_image(path: &Path) -> Result<ImageReader<std::io::BufReader<std::fs::File>>, Error> {
-    let open = || ImageReader::open(path)?.with_guessed_format();
+    let open = || ImageReader::new(std::io::BufReader::new(files::open(path)?)).with_guessed_format();
     open().map_err(|source| Error::Open { path: path.to_owned(), source })
 }
 

@@ -10,6 +10,7 @@ use crate::motion::{JointTarget, Motion, MotionConfig, MotionLimits, MotionLock,
 use crate::{Arm, Error};
 use franka::{FciVersion, RobotMode};
 use kinematics::JointState;
+use std::net::ToSocketAddrs;
 use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
@@ -64,7 +65,9 @@ impl MovableFrankaArm {
     pub fn open(config: &ArmConfig, motion: &MotionConfig, contact: &ContactConfig) -> Result<Self, Error> {
         let address = config.address.clone();
         Self::check(motion).map_err(|reason| Error::Fci { address: address.clone(), reason })?;
-        let lock = MotionLock::take(&address)?;
+        // One controller may have several names.
+        let resolved = (&*address, 0).to_socket_addrs().ok().and_then(|mut resolved| resolved.next());
+        let lock = MotionLock::take(&resolved.map_or_else(|| address.clone(), |resolved| resolved.ip().to_string()))?;
         let mailbox = Arc::new(MotionMailbox::default());
         let connected = OnceLock::new();
         let arm = FrankaArm::open_with(config, |session, first| {

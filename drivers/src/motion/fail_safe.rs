@@ -3,18 +3,18 @@
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
-/// Whether all arms must apply their fail-safe now.
+/// Whether all arms must send their fail-safe command now.
 static IS_DUE: AtomicBool = AtomicBool::new(false);
 /// Arms that this process commands, and that need a fail-safe command.
 static N_COMMANDED: AtomicUsize = AtomicUsize::new(0);
-/// Longer than the time in which the fail-safe command is resent to motors without a watchdog.
+/// The fail-safe command is resent for at most the largest timeout (2 s) plus 2 s.
 const MAX_WAIT: Duration = Duration::from_secs(5);
 
-/// Applies the fail-safe of all arms with CAN motors that this process moves, without bringing them to rest first, and
-/// waits until this is done, for at most 5 s. After that, these arms accept nothing. For use before the process ends
-/// without an orderly stop.
+/// Sends the fail-safe command to all arms with CAN motors that this process moves, without bringing them to rest first.
+/// Waits until their threads have ended, for at most 5 s. These arms accept no further commands. For use before the
+/// process ends without an orderly stop.
 ///
-/// Franka arms brake by themselves when the process ends.
+/// Franka arms brake when the connection ends.
 pub fn apply_fail_safe() {
     IS_DUE.store(true, Ordering::Relaxed);
     let deadline = Instant::now() + MAX_WAIT;
@@ -33,7 +33,7 @@ impl CommandedArm {
         Self(())
     }
 
-    /// Whether the arm must apply its fail-safe now.
+    /// Whether the arm must send its fail-safe command now.
     pub(crate) fn is_fail_safe_due() -> bool {
         IS_DUE.load(Ordering::Relaxed)
     }

@@ -1,4 +1,4 @@
-//! Only one program at a time may move the arm on a bus or controller.
+//! Only one process at a time may move the arm on a bus or controller.
 
 use crate::Error;
 use rustix::net::sockopt::socket_peercred;

@@ -14,7 +14,7 @@ pub struct DatagramCounts {
     pub n_rejected: u64,
     /// Number of missing sequence numbers and missing parts of scans.
     pub n_lost: u64,
-    /// Number of datagrams from other senders than the one that is being received from.
+    /// Number of datagrams from senders other than the current one.
     pub n_foreign: u64,
     /// Number of datagrams that were duplicates or arrived after a later one.
     pub n_late: u64,
@@ -32,11 +32,11 @@ pub struct DatagramCounts {
 /// Message for a restart of the sender's clock.
 pub(super) const CLOCK_RESTARTED: &str = "the sender's clock restarted or jumped, or it does not count nanoseconds";
 
-/// A sender is received from until it has been silent for this long. Then another one may take its place: a restarted
-/// sender usually has a new address.
+/// Another sender may replace the current one after this time without a datagram from it. A restarted sender usually has a
+/// new address.
 const MAX_SENDER_SILENCE: Duration = Duration::from_secs(2);
 
-/// The sender that is being received from: one at a time, so that two programs cannot interleave their values.
+/// The current sender: one at a time, so that the data of two programs cannot mix.
 #[derive(Debug, Default)]
 pub(super) struct Senders {
     current: Option<(SocketAddr, Stamp)>,
@@ -44,17 +44,19 @@ pub(super) struct Senders {
 }
 
 impl Senders {
-    /// Whether a datagram from this address is received. Counts and logs the others.
+    /// Returns whether to use a datagram from this address. Counts and logs the others.
     pub(super) fn accepts(&mut self, device: &str, from: SocketAddr, at: Stamp, n_foreign: &mut u64) -> bool {
         match self.current {
             Some((current, last)) if current != from && at.duration_since(last) < MAX_SENDER_SILENCE => {
-                let what = format_args!("ignored a datagram from {from}, because {current} is sending, too");
+                let what =
+                    format_args!("ignored a datagram from {from}, because {current} is also sending; stop one of them");
                 count_and_warn(device, n_foreign, 1, what);
                 return false;
             }
             Some((current, _)) if current != from => {
-                let what =
-                    format_args!("now receiving from {from}; {current} has been silent for {MAX_SENDER_SILENCE:?}");
+                let what = format_args!(
+                    "now receiving from {from}; {current} was silent for more than {MAX_SENDER_SILENCE:?}"
+                );
                 count_and_warn(device, &mut self.n_changes, 1, what);
             }
             _ => {}

@@ -70,7 +70,8 @@ fn embedded(photo: &Photo, points: &[PointFit]) -> crate::Result<(String, ImageP
 
 fn read(file: &Path) -> crate::Result<DynamicImage> {
     let in_file = || format!("cannot read {}", file.display());
-    let reader = image::ImageReader::open(file).with_context(in_file)?.with_guessed_format().with_context(in_file)?;
+    let opened = std::io::BufReader::new(files::open(file).with_context(in_file)?);
+    let reader = image::ImageReader::new(opened).with_guessed_format().with_context(in_file)?;
     reader.decode().with_context(in_file)
 }
 

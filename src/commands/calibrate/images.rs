@@ -4,7 +4,9 @@ use crate::exit::BadArgument;
 use crate::print;
 use calibration::{BoardPoint, BoardView};
 use capture::CalibrationImage;
+use image::ImageReader;
 use session::calibration_report::{Photo, Photos, Unused};
+use std::io::BufReader;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use targets::{Counts, Detection, GrayImage, TargetSpec};
@@ -191,7 +193,7 @@ pub(super) fn other_size<'a>(
 
 fn detect_in_file(path: &Path, name: &str, target: &TargetSpec) -> Result<Board, NoBoard> {
     let unreadable = |error: image::ImageError| NoBoard::Unreadable(error.to_string());
-    let reader = image::ImageReader::open(path).and_then(image::ImageReader::with_guessed_format);
+    let reader = files::open(path).map(BufReader::new).and_then(|file| ImageReader::new(file).with_guessed_format());
     let gray = reader.map_err(|error| unreadable(error.into()))?.decode().map_err(unreadable)?.into_luma8();
     let size_px = [gray.width(), gray.height()];
     detect_in_gray(GrayImage { size_px, pixels: gray.as_raw() }, name, target)

@@ -149,7 +149,9 @@ impl MoveFlags {
                 .into());
             }
         }
-        let stop = signals::stop_on_signals_logging("stopping the arm, then calibrating; Ctrl-C again exits at once")?;
+        let stop = signals::stop_on_signals_logging(
+            "bringing the arm to rest, then calibrating; Ctrl-C again applies on_loss at once",
+        )?;
         if !is_simulated {
             signals::stop_when_output_closes(&stop)?;
         }
