@@ -226,7 +226,7 @@ mod emulated_controller {
         child.wait().expect("our own child");
         // Two images do not determine the pose of the camera.
         assert!(
-            text.contains("stopping the arm, then calibrating") && text.contains("at least 3 are needed"),
+            text.contains("bringing the arm to rest, then calibrating") && text.contains("at least 3 are needed"),
             "{text}"
         );
         assert!(!text.contains("] pose 3: ") && !text.contains("returning to the start"), "{text}");
@@ -259,7 +259,7 @@ fn interrupted_arm_is_calibrated_with_the_images_so_far() {
     log.read_to_string(&mut text).expect("text");
     let output = child.wait_with_output().expect("it ends");
     assert!(output.status.success(), "{text}");
-    assert!(text.contains("stopping the arm") && !text.contains("returning to the start"), "{text}");
+    assert!(text.contains("bringing the arm to rest") && !text.contains("returning to the start"), "{text}");
     check_pose(&json_of(&output), MAX_DEG_WITH_LENS);
 }
 
