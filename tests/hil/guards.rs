@@ -91,9 +91,7 @@ fn obstacle_stops_the_arm() {
 fn second_program_cannot_move_the_arm() {
     let wire = Wire::new("vcan14", false);
     let rig = rig_without_watchdogs();
-    let motors = Motors::new(wire.config(false), Rig::load(&rig, &[]).expect("a rig file").arm.motors, false);
-    let mut moving = start_move(&rig);
-    motors.wait_until("the arm moves", |observed| observed[0].velocity_rad_s.abs() > 0.1);
+    let (motors, mut moving) = moving_arm(&wire, &rig);
     let second = Command::new("/bin/fieldrig").arg("move").arg(&rig).args(["--recover", "--enable-motion"]).output();
     let second = second.expect("fieldrig is installed");
     let printed = String::from_utf8_lossy(&second.stderr);
@@ -137,9 +135,7 @@ fn second_ctrl_c_applies_the_fail_safe() {
     let wire = Wire::new("vcan14", false);
     let rig = rig_without_watchdogs();
     for trial in 0..n_trials() {
-        let motors = Motors::new(wire.config(false), Rig::load(&rig, &[]).expect("a rig file").arm.motors, false);
-        let mut moving = start_move(&rig);
-        motors.wait_until("the arm moves", |observed| observed[0].velocity_rad_s.abs() > 0.1);
+        let (motors, mut moving) = moving_arm(&wire, &rig);
         wait_for_trial(trial);
         // The first one brings the arm to rest, which takes seconds at the acceleration of this rig.
         interrupt(&moving);
@@ -161,9 +157,7 @@ fn closed_output_stops_the_motion() {
     let wire = Wire::new("vcan14", false);
     let rig = rig_without_watchdogs();
     for trial in 0..n_trials() {
-        let motors = Motors::new(wire.config(false), Rig::load(&rig, &[]).expect("a rig file").arm.motors, false);
-        let mut moving = start_move(&rig);
-        motors.wait_until("the arm moves", |observed| observed[0].velocity_rad_s.abs() > 0.1);
+        let (motors, mut moving) = moving_arm(&wire, &rig);
         wait_for_trial(trial);
         if trial % 2 == 0 {
             drop(moving.stdout.take());
@@ -209,16 +203,19 @@ fn rig_without_watchdogs() -> PathBuf {
     path.to_owned()
 }
 
-/// Starts a motion of the first joint that takes several seconds.
-fn start_move(rig: &Path) -> Child {
-    Command::new("/bin/fieldrig")
+/// Starts the motors of a rig and a motion of the first joint that takes several seconds, and waits until it moves.
+fn moving_arm(wire: &Wire, rig: &Path) -> (Motors, Child) {
+    let motors = Motors::new(wire.config(false), Rig::load(rig, &[]).expect("a rig file").arm.motors, false);
+    let moving = Command::new("/bin/fieldrig")
         .arg("move")
         .arg(rig)
         .args(["--by", "joint1=2.5", "--enable-motion"])
         .stdout(Stdio::piped())
         .stderr(Stdio::piped())
         .spawn()
-        .expect("fieldrig is installed")
+        .expect("fieldrig is installed");
+    motors.wait_until("the arm moves", |observed| observed[0].velocity_rad_s.abs() > 0.1);
+    (motors, moving)
 }
 
 fn interrupt(child: &Child) {
