@@ -141,15 +141,15 @@ impl Unfinished {
                 }
                 Err(error) if error.kind() == ErrorKind::AlreadyExists => {
                     let flags = OFlags::RDONLY | OFlags::NOFOLLOW | OFlags::NONBLOCK | OFlags::CLOEXEC;
-                    let leftover = rustix::fs::open(&unfinished, flags, Mode::empty()).map(File::from);
-                    // A symbolic link and a socket cannot be opened, and no program is writing them.
-                    if let Ok(leftover) = leftover
-                        && !try_lock(&leftover)?
-                    {
-                        return Err(busy());
+                    match rustix::fs::open(&unfinished, flags, Mode::empty()).map(File::from) {
+                        Ok(leftover) if !try_lock(&leftover)? => return Err(busy()),
+                        // The lock is held while the leftover is removed, so that no other program removes a successor.
+                        Ok(leftover) if is_at(&leftover, &unfinished) => remove_leftover(&unfinished, path)?,
+                        // Its program has just published or removed it.
+                        Ok(_) | Err(rustix::io::Errno::NOENT) => {}
+                        // A symbolic link and a socket cannot be opened, and no program is writing them.
+                        Err(_) => remove_leftover(&unfinished, path)?,
                     }
-                    check_is_leftover(&unfinished, path)?;
-                    partial::remove(&unfinished);
                 }
                 Err(error) => return Err(error),
             }
@@ -158,20 +158,20 @@ impl Unfinished {
     }
 }
 
-/// Checks that a folder with a temporary name contains nothing but the file that was to be written.
-fn check_is_leftover(unfinished: &Path, path: &Path) -> std::io::Result<()> {
-    if !unfinished.symlink_metadata()?.is_dir() {
-        return Ok(());
-    }
+/// Removes what has a temporary name. A folder is removed only if it contains nothing but the file that was to be written.
+fn remove_leftover(unfinished: &Path, path: &Path) -> std::io::Result<()> {
     let inside = unfinished.join(path.file_name().unwrap_or_default());
     let own = [partial::path_of(&inside), inside];
-    match std::fs::read_dir(unfinished)?.flatten().find(|entry| !own.contains(&entry.path())) {
-        None => Ok(()),
-        Some(_) => Err(Error::new(
+    if unfinished.symlink_metadata().is_ok_and(|metadata| metadata.is_dir())
+        && std::fs::read_dir(unfinished)?.flatten().any(|entry| !own.contains(&entry.path()))
+    {
+        return Err(Error::new(
             ErrorKind::AlreadyExists,
             format!("{} is a folder with other files; remove it, or choose another name", unfinished.display()),
-        )),
+        ));
     }
+    partial::remove(unfinished);
+    Ok(())
 }
 
 /// Takes the lock of an open file; returns whether it was free. On a file system without locks, always returns true.
@@ -307,6 +307,24 @@ mod tests {
         assert_eq!(created.expect_err("it exists").kind(), ErrorKind::AlreadyExists);
         assert_eq!(std::fs::read(&other).expect("a file"), b"early");
         assert_eq!(names(folder.path()), ["b.ply", "scene.ply"]);
+    }
+
+    #[test]
+    fn simultaneous_writers_write_or_are_refused() {
+        const N_WRITERS: usize = 4;
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("scene.ply");
+        let write_often = || {
+            let mut n_written = 0;
+            while n_written < 200 {
+                match replace(&path, text("scene")) {
+                    Ok(()) => n_written += 1,
+                    Err(error) => assert_eq!(error.kind(), ErrorKind::ResourceBusy, "{error}"),
+                }
+            }
+        };
+        std::thread::scope(|scope| (0..N_WRITERS).for_each(|_| drop(scope.spawn(write_often))));
+        assert_eq!(names(folder.path()), ["scene.ply"]);
     }
 
     #[test]

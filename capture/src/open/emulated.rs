@@ -15,6 +15,10 @@ use sim::wire::{JointTrack, emulate_fci};
 use std::net::{Ipv4Addr, SocketAddr};
 use std::time::Duration;
 
+/// How long the controller waits for each answer of the driver. Both are in this process, and the motion must not depend on
+/// the load of the computer.
+const ANSWER_WAIT: Duration = Duration::from_millis(15);
+
 /// Opens the camera, and the arm for motion. The address of the arm becomes that of the controller.
 pub(super) fn open(rig: &mut Rig) -> crate::Result<(Box<dyn MovableArm>, Box<dyn Camera>)> {
     if rig.arm.driver != ArmDriver::Franka {
@@ -31,7 +35,7 @@ pub(super) fn open(rig: &mut Rig) -> crate::Result<(Box<dyn MovableArm>, Box<dyn
         limits: Limits::panda(),
     };
     let track = JointTrack::at_rest(simulated.start_position()?).map_err(crate::Error::other)?;
-    let controller = emulate_fci(track, config, Some(motors.clone()))?;
+    let controller = emulate_fci(track, config, ANSWER_WAIT, Some(motors.clone()))?;
     rig.arm.address = controller.address().to_string();
     log::info!("the arm is moved by an emulated Franka controller at {}", rig.arm.address);
     let Some(camera) = simulated.into_motorized(motors, clock::now())?.into_iter().next() else {

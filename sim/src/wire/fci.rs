@@ -5,13 +5,16 @@ use crate::MotorHistory;
 use drivers::Error;
 use drivers::franka::emulated::{CommandedJoints, EmulatedRobot, Joints, RobotConfig};
 use kinematics::JointState;
+use std::time::Duration;
 
 /// Accepts clients until it is dropped. Once a client has moved the arm, it follows client commands only.
 ///
+/// * `answer_wait`: as in [`EmulatedRobot::start_waiting`]; zero on a real robot
 /// * `motors`: gets the joints once per millisecond.
 pub fn emulate_fci(
     track: JointTrack,
     config: RobotConfig,
+    answer_wait: Duration,
     motors: Option<MotorHistory>,
 ) -> Result<EmulatedRobot, Error> {
     let mut is_client_controlled = false;
@@ -40,5 +43,5 @@ pub fn emulate_fci(
         }
         joints
     };
-    EmulatedRobot::start(config, Box::new(joint_simulator))
+    EmulatedRobot::start_waiting(config, answer_wait, Box::new(joint_simulator))
 }

@@ -217,7 +217,7 @@ impl EmulatedDevices {
         let mut descriptions = Vec::new();
         match rig.arm.driver {
             ArmDriver::Franka => {
-                let open = emulate_fci(track()?, robot_config(rig, &args.fci)?, None)?;
+                let open = emulate_fci(track()?, robot_config(rig, &args.fci)?, Duration::ZERO, None)?;
                 descriptions.push(format!("arm: a Franka controller at {}, FCI {}", open.address(), args.fci));
                 robot = Some(open);
             }
