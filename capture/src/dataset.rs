@@ -2,7 +2,7 @@
 
 use crate::downscale;
 use crate::error::Context;
-use drivers::dataset::{Dataset, DatasetImage, DepthImage};
+use drivers::dataset::{Dataset, DatasetImage, DepthImage, ListedSplit};
 use keyframe::ensure;
 use keyframe::{DepthMap, Holdout, Keyframe, Split, counted};
 use kinematics::{Intrinsics, Undistortion};
@@ -28,7 +28,7 @@ pub struct LoadedDataset {
 
 /// Decodes all photos in parallel.
 ///
-/// `holdout` assigns the splits. `scale_frac` scales the undistorted photos (not their depth) by averaging areas; 1
+/// `holdout` assigns the splits; without it, the lists of the dataset do, or [`Holdout::default`] if it has none. `scale_frac` scales the undistorted photos (not their depth) by averaging areas; 1
 /// keeps their size. `on_progress` receives the number of finished photos, from any thread. A photo that does not decode
 /// is skipped and reported in `data_losses`.
 ///
@@ -37,7 +37,7 @@ pub struct LoadedDataset {
 /// If no photo decodes, the scaled photos would be too small, or `holdout` does not match the names.
 pub fn load(
     dataset: &Dataset,
-    holdout: &Holdout,
+    holdout: Option<&Holdout>,
     scale_frac: f64,
     on_progress: &(dyn Fn(usize) + Sync),
 ) -> crate::Result<LoadedDataset> {
@@ -45,7 +45,14 @@ pub fn load(
         downscale::intrinsics(&image.intrinsics, scale_frac).with_context(|| image.name.clone())?;
     }
     let names: Vec<&str> = dataset.images.iter().map(|image| image.name.as_str()).collect();
-    let splits = holdout.splits(&names).with_context(|| dataset.path.display().to_string())?;
+    let listed = || dataset.images.iter().map(|image| image.listed.map(split_of)).collect::<Option<Vec<Split>>>();
+    let splits = match holdout.map_or_else(listed, |_| None) {
+        Some(listed) => listed,
+        None => {
+            let holdout = holdout.cloned().unwrap_or_default();
+            holdout.splits(&names).with_context(|| dataset.path.display().to_string())?
+        }
+    };
     let n_done = AtomicUsize::new(0);
     let camera: Arc<str> = CAMERA.into();
     let load_one = |(lens, image, split): (&LensMaps, &DatasetImage, Split)| {
@@ -53,7 +60,10 @@ pub fn load(
         on_progress(n_done.fetch_add(1, Ordering::Relaxed) + 1);
         (
             image.name.clone(),
-            keyframe.map(|(keyframe, depth)| (Keyframe { camera: camera.clone(), split, ..keyframe }, depth)),
+            keyframe.map(|converted| Converted {
+                keyframe: Keyframe { camera: camera.clone(), split, ..converted.keyframe },
+                ..converted
+            }),
         )
     };
 
@@ -69,30 +79,50 @@ pub fn load(
 
     let (notes, data_losses) = (dataset.notes.clone(), dataset.data_losses.clone());
     let mut loaded = LoadedDataset { keyframes: Vec::new(), names: Vec::new(), notes, data_losses };
-    let (mut image_errors, mut depth_errors) = (Vec::new(), Vec::new());
+    let (mut image_errors, mut depth_errors, mut mask_warnings) = (Vec::new(), Vec::new(), Vec::new());
     for (name, result) in results {
         match result {
-            Ok((keyframe, depth_error)) => {
+            Ok(Converted { keyframe, depth_error, mask_warning }) => {
                 loaded.keyframes.push(Arc::new(keyframe));
                 loaded.names.push(name);
                 depth_errors.extend(depth_error);
+                mask_warnings.extend(mask_warning);
             }
             Err(error) => image_errors.push(format!("{error:#}")),
         }
+    }
+    if !mask_warnings.is_empty() {
+        let n_masks = counted(mask_warnings.len() as u64, "mask");
+        loaded.notes.push(format!("{n_masks} may exclude the wrong pixels: {}", first_of(&mask_warnings)));
     }
     ensure!(
         !loaded.keyframes.is_empty(),
         "{}: no photo can be used: {}",
         dataset.path.display(),
-        image_errors.join("; ")
+        first_of(&image_errors)
     );
     for (what, errors) in [("image", image_errors), ("depth image", depth_errors)] {
         if !errors.is_empty() {
             let n_unusable = counted(errors.len() as u64, what);
-            loaded.data_losses.push(format!("{n_unusable} cannot be used: {}", errors.join("; ")));
+            loaded.data_losses.push(format!("{n_unusable} cannot be used: {}", first_of(&errors)));
         }
     }
     Ok(loaded)
+}
+
+fn split_of(listed: ListedSplit) -> Split {
+    match listed {
+        ListedSplit::Train => Split::Train,
+        ListedSplit::Validation => Split::Validation,
+        ListedSplit::Test => Split::Test,
+    }
+}
+
+/// The first messages in one line.
+fn first_of(errors: &[String]) -> String {
+    const MAX_SHOWN: usize = 3;
+    let more = if errors.len() > MAX_SHOWN { "; ..." } else { "" };
+    format!("{}{more}", errors[..errors.len().min(MAX_SHOWN)].join("; "))
 }
 
 /// Undistortion maps of one lens; empty for a lens without distortion.
@@ -129,8 +159,15 @@ impl LensMaps {
     }
 }
 
-/// The keyframe of one photo, and an error message if its depth does not decode. The caller sets camera and split.
-fn keyframe(lens: &LensMaps, image: &DatasetImage, scale_frac: f64) -> crate::Result<(Keyframe, Option<String>)> {
+/// The keyframe of one photo, and messages about its other files.
+struct Converted {
+    keyframe: Keyframe,
+    depth_error: Option<String>,
+    mask_warning: Option<String>,
+}
+
+/// Converts one photo. The caller sets camera and split.
+fn keyframe(lens: &LensMaps, image: &DatasetImage, scale_frac: f64) -> crate::Result<Converted> {
     let loaded = image.load()?;
     let in_image = || image.name.clone();
     let depth = loaded.depth.as_ref().zip(image.depth.as_ref()).map(|(depth, file)| {
@@ -162,7 +199,7 @@ fn keyframe(lens: &LensMaps, image: &DatasetImage, scale_frac: f64) -> crate::Re
         split: Split::Train,
         truth: None,
     };
-    Ok((keyframe, loaded.depth_error))
+    Ok(Converted { keyframe, depth_error: loaded.depth_error, mask_warning: loaded.mask_warning })
 }
 
 #[cfg(test)]

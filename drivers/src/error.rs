@@ -325,6 +325,26 @@ pub enum Error {
         /// Error of the decoder.
         source: image::ImageError,
     },
+    /// An image of a dataset has a format that is known but cannot be read.
+    #[error(
+        "{path:?} is a {format} file; photos must be JPEG, PNG, WebP, TIFF or BMP, and depth 16-bit PNG or TIFF: convert it, for example with ImageMagick"
+    )]
+    ImageFormat {
+        /// The file.
+        path: PathBuf,
+        /// Name of its format.
+        format: &'static str,
+    },
+    /// An image of a dataset is too large for the memory of most computers.
+    #[error("{path:?} has {}x{} pixels, at most {max_px} are read", .got_px[0], .got_px[1])]
+    TooManyPixels {
+        /// The file.
+        path: PathBuf,
+        /// Width and height.
+        got_px: [u32; 2],
+        /// Maximum number of pixels.
+        max_px: u64,
+    },
     /// The size of an image or mask differs from that in the dataset.
     #[error("{path:?} has {got_px:?} pixels, expected {expected_px:?}")]
     DatasetImageSize {

@@ -62,13 +62,21 @@ pub fn read(path: &Path, max_bytes: u64) -> std::io::Result<Vec<u8>> {
     Ok(bytes)
 }
 
-/// Reads a text in UTF-8 of at most [`MAX_TEXT_BYTES`].
+/// Reads a text in UTF-8 of at most [`MAX_TEXT_BYTES`], without its byte order mark.
 ///
 /// # Errors
 /// As [`read`], and if the file is not UTF-8.
 pub fn read_text(path: &Path) -> std::io::Result<String> {
-    String::from_utf8(read(path, MAX_TEXT_BYTES)?)
-        .map_err(|_| Error::new(ErrorKind::InvalidData, "it is not UTF-8 text"))
+    let bytes = read(path, MAX_TEXT_BYTES)?;
+    let is_utf_16 = [[0xFF, 0xFE], [0xFE, 0xFF]].iter().any(|mark| bytes.starts_with(mark));
+    let mut text = String::from_utf8(bytes).map_err(|_| {
+        let found = if is_utf_16 { "it is UTF-16 text; save it as UTF-8" } else { "it is not UTF-8 text" };
+        Error::new(ErrorKind::InvalidData, found)
+    })?;
+    if text.starts_with('\u{FEFF}') {
+        text.drain(..'\u{FEFF}'.len_utf8());
+    }
+    Ok(text)
 }
 
 #[cfg(test)]
@@ -88,6 +96,10 @@ mod tests {
         assert_eq!(read(&at("text"), 11).expect_err("too large").kind(), ErrorKind::FileTooLarge);
         std::fs::write(at("latin"), [b'a', 0xE4]).expect("written");
         assert_eq!(read_text(&at("latin")).expect_err("not UTF-8").to_string(), "it is not UTF-8 text");
+        std::fs::write(at("marked"), "\u{FEFF}text").expect("written");
+        assert_eq!(read_text(&at("marked")).expect("text"), "text");
+        std::fs::write(at("wide"), [0xFF, 0xFE, b'a', 0]).expect("written");
+        assert_eq!(read_text(&at("wide")).expect_err("UTF-16").to_string(), "it is UTF-16 text; save it as UTF-8");
         assert_eq!(read(&at("absent"), 1).expect_err("absent").kind(), ErrorKind::NotFound);
         assert_eq!(read(folder.path(), 1).expect_err("a folder").to_string(), "it is a folder");
         let made = Command::new("mkfifo").arg(at("pipe")).status().expect("mkfifo is part of every system");

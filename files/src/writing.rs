@@ -115,25 +115,29 @@ struct Unfinished {
 
 impl Unfinished {
     fn file(path: &Path) -> std::io::Result<Self> {
-        Self::new(path, |unfinished| File::create_new(unfinished))
+        Self::new(path, |unfinished| File::create_new(unfinished).map(Some))
     }
 
     fn folder(path: &Path) -> std::io::Result<Self> {
         Self::new(path, |unfinished| {
             std::fs::create_dir(unfinished)?;
-            File::open(unfinished)
+            match File::open(unfinished) {
+                Err(error) if error.kind() == ErrorKind::NotFound => Ok(None),
+                opened => opened.map(Some),
+            }
         })
     }
 
     /// Makes and locks the temporary file. One that is left over from a program that was killed is removed first.
-    fn new(path: &Path, make: impl Fn(&Path) -> std::io::Result<File>) -> std::io::Result<Self> {
+    /// Until it is locked, another program may mistake it for a leftover and remove it; then `make` returns `None`.
+    fn new(path: &Path, make: impl Fn(&Path) -> std::io::Result<Option<File>>) -> std::io::Result<Self> {
         const MAX_ATTEMPTS: usize = 100;
         let busy = || Error::new(ErrorKind::ResourceBusy, "another program is writing it");
         let unfinished = partial::path_of(path);
         for _ in 0..MAX_ATTEMPTS {
             match make(&unfinished) {
-                Ok(file) => {
-                    // Another program may have mistaken it for a leftover and removed it before it was locked.
+                Ok(None) => {}
+                Ok(Some(file)) => {
                     if try_lock(&file)? && is_at(&file, &unfinished) {
                         let registered = Registered::new(&unfinished);
                         return Ok(Self { path: unfinished, registered, file });
@@ -314,13 +318,19 @@ mod tests {
         const N_WRITERS: usize = 4;
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("scene.ply");
+        let created = folder.path().join("scene.spz");
+        let until_written = |write: &dyn Fn() -> std::io::Result<()>| {
+            while let Err(error) = write() {
+                let is_refused = matches!(error.kind(), ErrorKind::ResourceBusy | ErrorKind::AlreadyExists);
+                assert!(is_refused, "{error}");
+            }
+        };
         let write_often = || {
-            let mut n_written = 0;
-            while n_written < 200 {
-                match replace(&path, text("scene")) {
-                    Ok(()) => n_written += 1,
-                    Err(error) => assert_eq!(error.kind(), ErrorKind::ResourceBusy, "{error}"),
-                }
+            for _ in 0..200 {
+                until_written(&|| replace(&path, text("scene")));
+                until_written(&|| create_from(&created, |inside| std::fs::write(inside, "scene")));
+                // Only its creator removes it.
+                std::fs::remove_file(&created).expect("it was created");
             }
         };
         std::thread::scope(|scope| (0..N_WRITERS).for_each(|_| drop(scope.spawn(write_often))));

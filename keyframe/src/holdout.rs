@@ -1,6 +1,8 @@
 //! Selects the photos of a dataset that are used for testing and validation.
 
 use crate::{Error, Split};
+use std::collections::HashMap;
+use std::ffi::OsStr;
 use std::path::Path;
 
 /// How test photos are chosen.
@@ -64,27 +66,35 @@ fn every_nth(ix: usize, every: usize) -> Split {
 }
 
 fn splits_by_name(test_names: &[String], names: &[&str]) -> Result<Vec<Split>, Error> {
-    for test_name in test_names {
-        if !names.iter().any(|name| matches_name(name, test_name)) {
-            return Err(Error::Holdout { request: format!("{test_name:?}"), reason: "no photo has this name".into() });
-        }
-    }
+    // Whether each name has matched a photo.
+    let mut requested: HashMap<&str, bool> = test_names.iter().map(|name| (name.as_str(), false)).collect();
     let mut n_remaining = 0;
-    let split = |name: &&str| {
-        if test_names.iter().any(|test_name| matches_name(name, test_name)) {
-            return Split::Test;
+    let mut splits = Vec::with_capacity(names.len());
+    for name in names {
+        let mut is_test = false;
+        for form in forms(name) {
+            if let Some(is_matched) = requested.get_mut(form) {
+                (*is_matched, is_test) = (true, true);
+            }
         }
-        n_remaining += 1;
-        if n_remaining % 8 == 5 { Split::Validation } else { Split::Train }
-    };
-    Ok(names.iter().map(split).collect())
+        n_remaining += usize::from(!is_test);
+        splits.push(match is_test {
+            true => Split::Test,
+            false if n_remaining % 8 == 5 => Split::Validation,
+            false => Split::Train,
+        });
+    }
+    match test_names.iter().find(|name| !requested[name.as_str()]) {
+        Some(name) => Err(Error::Holdout { request: format!("{name:?}"), reason: "no photo has this name".into() }),
+        None => Ok(splits),
+    }
 }
 
-/// Whether `requested` matches a photo by its path in the folder, its file name, or its file name without extension.
-fn matches_name(name: &str, requested: &str) -> bool {
+/// The names by which a photo may be requested: its path in the folder, its file name, and its file name without extension.
+fn forms(name: &str) -> impl Iterator<Item = &str> {
     let path = Path::new(name);
     let parts = [path.file_name(), path.file_stem()];
-    name == requested || parts.into_iter().flatten().any(|part| part == requested)
+    std::iter::once(name).chain(parts.into_iter().flatten().filter_map(OsStr::to_str))
 }
 
 #[cfg(test)]

@@ -3,6 +3,7 @@
 use crate::urdf::{Joint, JointKind, JointLimits, Robot};
 use crate::{Error, Transform, Twist};
 use nalgebra::{Matrix6xX, Quaternion, Translation3, Unit, UnitQuaternion, Vector3};
+use std::collections::HashMap;
 
 /// The joints between two links of a robot, ready to compute poses.
 ///
@@ -55,7 +56,11 @@ impl Chain {
             last_from_tip: RigidMotion::new(&Transform::identity()),
         };
         let mut constant = Transform::identity();
+        let (mut rules, mut indices) = (MimicRules::new(), HashMap::new());
         for joint in robot.path(base_link, tip_link)? {
+            if let Some(problem) = &joint.problem {
+                return Err(problem.clone());
+            }
             constant *= joint.parent_from_joint;
             let is_prismatic = match joint.kind {
                 JointKind::Fixed => continue,
@@ -66,8 +71,8 @@ impl Chain {
                 }
             };
             let joint_from_aligned = rotation_from_z_to(&joint.axis);
-            let rule = follow_mimics(robot, joint)?;
-            let joint_ix = chain.index_of(rule.source);
+            let rule = follow_mimics(robot, joint, &mut rules)?;
+            let joint_ix = *indices.entry(&rule.source.name).or_insert_with(|| chain.add(rule.source));
             chain.segments.push(Segment {
                 before: RigidMotion::new(&(constant * joint_from_aligned)),
                 is_prismatic,
@@ -205,10 +210,7 @@ impl Chain {
         }
     }
 
-    fn index_of(&mut self, source: &Joint) -> usize {
-        if let Some(known_ix) = self.joint_names.iter().position(|name| *name == source.name) {
-            return known_ix;
-        }
+    fn add(&mut self, source: &Joint) -> usize {
         self.joint_names.push(source.name.clone());
         self.limits.push(source.limits);
         self.joint_names.len() - 1
@@ -217,28 +219,48 @@ impl Chain {
 
 /// How a joint follows an independent joint: `multiplier * source + offset`. A joint without `<mimic>` is its own
 /// source.
+#[derive(Clone, Copy)]
 struct MimicRule<'a> {
     source: &'a Joint,
     multiplier: f64,
     offset: f64,
 }
 
-fn follow_mimics<'a>(robot: &'a Robot, joint: &'a Joint) -> Result<MimicRule<'a>, Error> {
-    let mut rule = MimicRule { source: joint, multiplier: 1.0, offset: 0.0 };
-    let mut n_mimics = 0;
-    while let Some(mimic) = &rule.source.mimic {
+/// The known rules, by joint: chains of mimic joints are followed once.
+type MimicRules<'a> = HashMap<&'a str, MimicRule<'a>>;
+
+fn follow_mimics<'a>(robot: &'a Robot, joint: &'a Joint, rules: &mut MimicRules<'a>) -> Result<MimicRule<'a>, Error> {
+    let mut followers = Vec::new();
+    let mut current = joint;
+    let mut rule = loop {
+        if let Some(known) = rules.get(current.name.as_str()) {
+            break *known;
+        }
+        let Some(mimic) = &current.mimic else {
+            break MimicRule { source: current, multiplier: 1.0, offset: 0.0 };
+        };
         let rejected = |why| Error::Mimic { joint: joint.name.clone(), source_joint: mimic.source.clone(), why };
         let source = robot.joint(&mimic.source).ok_or_else(|| rejected("is not in the URDF"))?;
+        if let Some(problem) = &source.problem {
+            return Err(problem.clone());
+        }
         if !matches!(source.kind, JointKind::Revolute | JointKind::Prismatic) {
             return Err(rejected("is not a revolute, continuous or prismatic joint"));
         }
-        n_mimics += 1;
-        if n_mimics > robot.joints().len() {
+        if followers.len() >= robot.joints().len() {
             return Err(rejected("creates a loop of mimic joints"));
         }
-        rule.offset += rule.multiplier * mimic.offset;
-        rule.multiplier *= mimic.multiplier;
-        rule.source = source;
+        followers.push((current, mimic));
+        current = source;
+    };
+    while let Some((follower, mimic)) = followers.pop() {
+        let MimicRule { source, multiplier, offset } = rule;
+        rule = MimicRule {
+            source,
+            multiplier: mimic.multiplier * multiplier,
+            offset: mimic.multiplier * offset + mimic.offset,
+        };
+        rules.insert(&follower.name, rule);
     }
     Ok(rule)
 }

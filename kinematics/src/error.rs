@@ -54,10 +54,20 @@ pub enum Error {
         /// Height in pixels.
         height: u32,
     },
-    /// The text is not a valid URDF.
+    /// The text is not XML, or describes no robot.
     #[error("urdf: cannot be read: {why}")]
     UrdfSyntax {
         /// Parser message.
+        why: String,
+    },
+    /// An element that the kinematics depend on is invalid.
+    #[error("urdf: line {line}: {what}: {why}")]
+    UrdfElement {
+        /// Line in the file, from 1.
+        line: u32,
+        /// Kind and name of the element.
+        what: String,
+        /// Description of the problem.
         why: String,
     },
     /// The file parses but contains no robot.
@@ -67,12 +77,14 @@ pub enum Error {
         robot: String,
     },
     /// Two links or two joints share a name.
-    #[error("urdf: {kind} {name:?} is defined twice")]
+    #[error("urdf: {kind} {name:?} is defined twice, in lines {} and {}", .lines[0], .lines[1])]
     Duplicate {
         /// `link` or `joint`.
         kind: &'static str,
         /// The shared name.
         name: String,
+        /// Lines of both elements, from 1.
+        lines: [u32; 2],
     },
     /// A joint refers to an undefined link.
     #[error("urdf: joint {joint:?} joins link {link:?}, which is not defined")]
@@ -131,16 +143,6 @@ pub enum Error {
         joint: String,
         /// Its type.
         kind: &'static str,
-    },
-    /// A number in a joint's description is non-finite or out of range, or the axis of the joint is zero.
-    #[error("joint {joint:?}: {what} is {value:?}, which is invalid")]
-    JointNumber {
-        /// The joint.
-        joint: String,
-        /// Name of the number.
-        what: &'static str,
-        /// Its value.
-        value: [f64; 3],
     },
     /// A mimic joint follows a joint that does not exist or is not revolute, continuous or prismatic, or mimic joints
     /// form a loop.

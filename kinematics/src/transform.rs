@@ -20,6 +20,8 @@ pub struct Twist {
 /// Largest element of `|RᵀR - 1|` that is accepted as a rounding error in a file. Quaternions with three decimals stay
 /// below it; a scale error of 0.1 % exceeds it.
 pub const RIGID_TOLERANCE: f64 = 1e-3;
+/// As [`RIGID_TOLERANCE`], for matrices with three decimals, which deviate by up to `2 * sqrt(3) * 0.0005`.
+pub const ROUNDED_TOLERANCE: f64 = 2e-3;
 
 /// Below this angle, in radians, [`exp`] and [`log`] use series instead of quotients. At this angle, series and
 /// quotients agree to 1e-16.
@@ -34,6 +36,23 @@ const SMALL_ANGLE_RAD: f64 = 1e-4;
 /// Rejects non-finite elements, a last row other than `0 0 0 1`, and a rotation part that is mirrored or deviates by
 /// more than [`RIGID_TOLERANCE`].
 pub fn from_rows(rows: &[f64; 16]) -> Result<Transform, Error> {
+    from_rows_within(rows, RIGID_TOLERANCE)
+}
+
+/// Like [`from_rows`], for numbers that may be rounded to three decimals. Also returns whether they deviate by more than
+/// [`from_rows`] accepts. The rotation is then wrong by up to 0.1 degrees.
+///
+/// # Errors
+///
+/// As [`from_rows`], with [`ROUNDED_TOLERANCE`].
+pub fn from_rounded_rows(rows: &[f64; 16]) -> Result<(Transform, bool), Error> {
+    match from_rows(rows) {
+        Err(Error::NotRigid { .. }) => Ok((from_rows_within(rows, ROUNDED_TOLERANCE)?, true)),
+        exact => Ok((exact?, false)),
+    }
+}
+
+fn from_rows_within(rows: &[f64; 16], tolerance: f64) -> Result<Transform, Error> {
     if let Some(at) = rows.iter().position(|value| !value.is_finite()) {
         return Err(Error::TransformNotFinite { row: at / 4, column: at % 4, value: rows[at] });
     }
@@ -44,8 +63,8 @@ pub fn from_rows(rows: &[f64; 16]) -> Result<Transform, Error> {
     let given = Matrix3::from_fn(|row, column| rows[4 * row + column]);
     let off = (given.transpose() * given - Matrix3::identity()).abs().max();
     let determinant = given.determinant();
-    if off > RIGID_TOLERANCE || determinant < 0.0 {
-        return Err(Error::NotRigid { off, allowed: RIGID_TOLERANCE, determinant });
+    if off > tolerance || determinant < 0.0 {
+        return Err(Error::NotRigid { off, allowed: tolerance, determinant });
     }
     let translation = Translation3::new(rows[3], rows[7], rows[11]);
     Ok(Transform::from_parts(translation, UnitQuaternion::from_rotation_matrix(&nearest_rotation(given))))

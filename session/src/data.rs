@@ -190,7 +190,7 @@ impl Data {
         } else if let Some(rig) = rig {
             return Err(Error::BadInput(format!("--rig {}: only recordings take a rig file", rig.display())));
         } else {
-            Self::from_folder(path, &holdout.clone().unwrap_or_default(), scale.unwrap_or(1.0), list, progress)?
+            Self::from_folder(path, holdout.as_ref(), scale.unwrap_or(1.0), list, progress)?
         };
         if let (true, Some(holdout)) = (is_recording, &holdout) {
             data.assign_splits(holdout)?;
@@ -205,6 +205,19 @@ impl Data {
         if data.of_split(required_split).is_empty() {
             let n_images = counted(data.keyframes.len() as u64, "image");
             return Err(Error::InsufficientData(format!("{}: {message} among {n_images}", path.display())));
+        }
+        let is_masked = |keyframe: &&Arc<Keyframe>| keyframe.rgba_srgb.chunks_exact(4).all(|pixel| pixel[3] == 0);
+        let n_masked = data.keyframes.iter().filter(is_masked).count();
+        if n_masked == data.keyframes.len() {
+            return Err(Error::InsufficientData(format!(
+                "{}: no pixel of any image can be used: masks, transparency or lens parameters exclude all of them (black in \
+                 a mask means \"do not use\")",
+                path.display()
+            )));
+        }
+        if n_masked > 0 {
+            let n_images = counted(n_masked as u64, "image");
+            log::warn!("{}: no pixel of {n_images} can be used, because all are masked", path.display());
         }
         Ok(data)
     }
@@ -265,7 +278,7 @@ impl Data {
 
     fn from_folder(
         path: &Path,
-        holdout: &Holdout,
+        holdout: Option<&Holdout>,
         scale: f64,
         list: Option<KeyframeList>,
         progress: OnReadProgress<'_>,

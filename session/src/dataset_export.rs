@@ -208,7 +208,7 @@ mod tests {
         let dataset = drivers::dataset::read(out).unwrap();
         assert!(dataset.notes.is_empty(), "{:?}", dataset.notes);
         let holdout = Holdout::from_argument(out.join(TEST_LIST).to_str().unwrap()).unwrap();
-        dataset::load(&dataset, &holdout, 1.0, &|_| ()).unwrap().keyframes
+        dataset::load(&dataset, Some(&holdout), 1.0, &|_| ()).unwrap().keyframes
     }
 
     #[test]

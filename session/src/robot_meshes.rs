@@ -22,9 +22,6 @@ pub fn description(rig: &Rig, rig_file: &Path) -> crate::Result<Option<RobotDesc
         return Ok(None);
     }
     let robot = Robot::parse(&rig.arm.urdf_text).context("the arm's URDF")?;
-    for problem in robot.ignored_shapes() {
-        log::warn!("the robot is drawn incompletely: {problem}");
-    }
     let folder = Rig::urdf_folder(rig_file).unwrap_or_default();
     let meshes = meshes(&robot, &folder);
     let (base_link, joint_names) = (rig.arm.base_link.clone(), rig.arm.joints.clone());

@@ -29,7 +29,18 @@ impl EmulatedRig {
     fn start(folder: &Path) -> Self {
         let alone = ONE_AT_A_TIME.lock();
         let mut child = Command::new(env!("CARGO_BIN_EXE_fieldrig"))
-            .args(["sim", "static-arm", "--seconds", "3", "--start-in", START_IN, "--json", "--out"])
+            .args([
+                "sim",
+                "static-arm",
+                "--seconds",
+                "3",
+                "--start-in",
+                START_IN,
+                "--answer-wait",
+                "15",
+                "--json",
+                "--out",
+            ])
             .arg(folder)
             .stdout(Stdio::piped())
             .spawn()

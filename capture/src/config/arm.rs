@@ -106,12 +106,14 @@ pub(super) fn write(arm: &Arm) -> Table {
 /// Checks links and joints against the robot description and fills in the joints if the rig file lists none.
 pub(super) fn resolve_joints(file: &str, arm: &mut Arm) -> Result<(), ConfigError> {
     let robot = |key, e: kinematics::Error| ConfigError::Robot { file: file.to_owned(), key, reason: e.to_string() };
+    let description = kinematics::urdf::Robot::parse(&arm.urdf_text).map_err(|e| robot("arm.urdf", e))?;
+    for note in description.notes() {
+        log::warn!("{file}: arm.urdf: {note}");
+    }
     if arm.base_link.is_empty() {
-        let description = kinematics::urdf::Robot::parse(&arm.urdf_text).map_err(|e| robot("arm.urdf", e))?;
         arm.base_link = description.root().map_err(|e| robot("arm.urdf", e))?.to_owned();
     }
-    let chain =
-        Chain::from_urdf(&arm.urdf_text, &arm.base_link, &arm.flange_link).map_err(|e| robot("arm.flange_link", e))?;
+    let chain = Chain::new(&description, &arm.base_link, &arm.flange_link).map_err(|e| robot("arm.flange_link", e))?;
     if arm.joints.is_empty() {
         arm.joints = chain.joint_names().to_vec();
     }

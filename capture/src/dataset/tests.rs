@@ -23,7 +23,7 @@ fn folder_of(n: usize, lens: &Value) -> tempfile::TempDir {
 }
 
 fn load_at(folder: &Path, scale_frac: f64) -> crate::Result<LoadedDataset> {
-    load(&drivers::dataset::read(folder)?, &Holdout::default(), scale_frac, &|_| ())
+    load(&drivers::dataset::read(folder)?, None, scale_frac, &|_| ())
 }
 
 #[test]
@@ -32,7 +32,7 @@ fn fox_becomes_undistorted_keyframes() {
     let max_done = AtomicUsize::new(0);
     let dataset = drivers::dataset::read(&folder).unwrap();
     let on_progress = |n_done| _ = max_done.fetch_max(n_done, Ordering::Relaxed);
-    let loaded = load(&dataset, &Holdout::default(), 0.25, &on_progress).unwrap();
+    let loaded = load(&dataset, None, 0.25, &on_progress).unwrap();
     assert_eq!((loaded.keyframes.len(), max_done.into_inner()), (50, 50));
     assert!(loaded.notes[0].starts_with("17 images"), "{:?}", loaded.notes);
     let of = |split| loaded.keyframes.iter().filter(|keyframe| keyframe.split == split).count();

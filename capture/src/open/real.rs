@@ -97,6 +97,11 @@ pub(super) fn motion_limits(rig: &Rig, acceleration_secs: f64, jerk_secs: f64) -
         let joint_ix = chain.joint_names().iter().position(|known| known == name);
         let joint =
             joint_ix.map(|joint_ix| chain.limits()[joint_ix]).context("a joint of the rig is not in its URDF")?;
+        if !joint.is_range_valid {
+            bail!(
+                "arm.motion: the URDF states no valid range for joint {name:?}; correct its <limit>, as the joint is not moved without one"
+            );
+        }
         let mut joint = MotionLimits::new(&joint, arm.max_speed_rad_s, acceleration_secs, jerk_secs);
         // URDF positions are device positions plus the offset.
         let offset = arm.joint_offsets.get(ix).copied().unwrap_or(0.0);
@@ -132,12 +137,12 @@ fn movable_config(rig: &Rig, motion: &ArmMotion) -> crate::Result<MovableArmConf
     Ok(MovableArmConfig { arm, motion: motion_config(rig, motion)?, odrive_endpoints })
 }
 
-/// Limits the efforts that the rig file does not limit to those of the robot description, where 0 means unknown.
+/// Limits the efforts that the rig file does not limit to those of the robot description.
 #[cfg(target_os = "linux")]
 fn limit_efforts(arm: &mut can::ArmConfig, chain: &kinematics::Chain) {
     for motor in &mut arm.motors {
         let joint_ix = chain.joint_names().iter().position(|joint| *joint == motor.joint);
-        let effort = joint_ix.map(|joint_ix| chain.limits()[joint_ix].effort).filter(|effort| *effort > 0.0);
+        let effort = joint_ix.map(|joint_ix| chain.limits()[joint_ix].effort).filter(|effort| effort.is_finite());
         motor.following.max_effort_nm = motor.following.max_effort_nm.or(effort);
     }
 }

@@ -4,7 +4,7 @@ pub mod nerfstudio;
 mod posed_image;
 pub mod tum;
 
-pub use posed_image::{DatasetImage, DepthFile, DepthImage, LoadedImage};
+pub use posed_image::{DatasetImage, DepthFile, DepthImage, ListedSplit, LoadedImage};
 
 use crate::Error;
 use std::path::{Path, PathBuf};
@@ -63,18 +63,30 @@ struct SkippedImages {
     /// Names of unusable images with the reason; also in `broken`.
     unusable: Vec<(String, String)>,
     broken: Vec<(String, String)>,
+    /// Messages about other parts of the dataset that cannot be used.
+    lost: Vec<String>,
 }
 
 impl SkippedImages {
     /// Maximum number of names in a note.
     const MAX_NAMED: usize = 5;
 
+    /// Reports lines of a list that cannot be used.
+    fn lines(&mut self, list: &str, reasons: &[String]) {
+        if !reasons.is_empty() {
+            let (lines, _) = plural(reasons.len(), "line");
+            self.lost.push(format!("{list}: {lines} cannot be used: {}", first_names(reasons)));
+        }
+    }
+
     /// Builds the dataset. Fails if it is empty.
     fn dataset(self, path: &Path, images: Vec<DatasetImage>, mut notes: Vec<String>) -> Result<Dataset, Error> {
         let (n_missing, n_unusable) = (self.missing.len(), self.unusable.len() + self.broken.len());
         if images.is_empty() {
-            let first_reason = self.broken.iter().chain(&self.unusable).next();
-            let first_reason = first_reason.map(|(name, reason)| format!(" ({name}: {reason})")).unwrap_or_default();
+            let first_broken = self.broken.iter().chain(&self.unusable).next();
+            let first_broken = first_broken.map(|(name, reason)| format!(" ({name}: {reason})"));
+            let first_missing = self.missing.first().map(|name| format!(" (such as {name})"));
+            let first_reason = first_broken.or(first_missing).unwrap_or_default();
             return Err(Error::EmptyDataset { path: path.to_owned(), n_missing, n_unusable, first_reason });
         }
         if n_missing > 0 {
@@ -82,7 +94,7 @@ impl SkippedImages {
             notes.push(format!("{what} {verb} missing: {}", first_names(&self.missing)));
         }
         notes.extend(unusable_note(&self.unusable));
-        let data_losses = unusable_note(&self.broken).into_iter().collect();
+        let data_losses = self.lost.into_iter().chain(unusable_note(&self.broken)).collect();
         Ok(Dataset { path: path.to_owned(), images, n_missing, n_unusable, notes, data_losses })
     }
 }

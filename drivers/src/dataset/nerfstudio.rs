@@ -3,25 +3,50 @@
 //! Cameras in these files look along -z with y up (OpenGL). Poses are converted to our convention only in this module.
 
 use super::posed_image::image_size_px;
-use super::{Dataset, DatasetImage, DepthFile, MAX_POSITION_M, SkippedImages, plural};
+use super::{Dataset, DatasetImage, DepthFile, ListedSplit, MAX_POSITION_M, SkippedImages, first_names, plural};
 use crate::Error;
 use kinematics::{Intrinsics, Lens, Stamp, Transform, transform};
 use nalgebra::{UnitQuaternion, Vector3};
 use serde::de::Error as _;
 use serde::{Deserialize, Deserializer};
+use serde_json::Value;
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::path::{Path, PathBuf};
 
 /// File that identifies such a folder.
 pub const FILE_NAME: &str = "transforms.json";
+/// Relative difference of two focal lengths that are meant to be equal.
+const MAX_FOCAL_DIFFERENCE: f64 = 0.01;
 /// Depth counts are millimeters unless the file specifies another unit.
 const DEFAULT_METERS_PER_COUNT: f64 = 0.001;
-/// Extensions tried when a path has none.
-const EXTENSIONS: [&str; 3] = ["png", "jpg", "jpeg"];
+/// With 65535 counts, depth of up to 6.5 cm and up to 65 km.
+const METERS_PER_COUNT: std::ops::RangeInclusive<f64> = 1e-6..=1.0;
+/// Extensions tried when a path has none, in lower and upper case.
+const EXTENSIONS: [&str; 7] = ["png", "jpg", "jpeg", "webp", "bmp", "tif", "tiff"];
+/// Keys of the file that are not used, because they do not change images, poses or lenses.
+const UNUSED: [&str; 14] = [
+    "aabb_scale",
+    "applied_scale",
+    "applied_transform",
+    "auto_scale_poses_override",
+    "fps",
+    "offset",
+    "orientation_override",
+    "scale",
+    // Keys of one frame.
+    "colmap_im_id",
+    "depth_width",
+    "depth_height",
+    "sharpness",
+    "timestamp",
+    "name",
+];
 
 /// Reads a folder, or the file itself.
 ///
 /// Images are sorted by file name. The following images are skipped and counted: duplicates, missing or broken files,
-/// poses that are not finite or not rigid, and poses that are implausibly far away.
+/// poses that are not finite or not rigid, and poses that are implausibly far away. If the file lists the images of the
+/// splits, images in no list are left out. The keys are explained in docs/reference/datasets.md.
 ///
 /// # Errors
 /// If the file cannot be parsed, no image is usable, or a frame uses an unsupported camera model; the error names the
@@ -37,15 +62,24 @@ pub fn read(path: &Path) -> Result<Dataset, Error> {
     let mut document: Document =
         serde_json::from_str(&nan_as_null(&text)).map_err(|error| file_error(error.to_string()))?;
     document.frames.sort_by(|a, b| a.file_path.cmp(&b.file_path));
+    let splits = document.splits().map_err(file_error)?;
     let meters_per_count = document.depth_unit_scale_factor.unwrap_or(DEFAULT_METERS_PER_COUNT);
-    if !(meters_per_count.is_finite() && meters_per_count > 0.0) {
-        return Err(file_error(format!("depth_unit_scale_factor is {meters_per_count}, expected a number above 0")));
+    if !METERS_PER_COUNT.contains(&meters_per_count) {
+        return Err(file_error(format!(
+            "depth_unit_scale_factor is {meters_per_count:e} meters per count, expected a number from 1e-6 to 1"
+        )));
     }
 
-    let (mut images, mut skipped, mut notes) = (Vec::new(), SkippedImages::default(), Vec::new());
+    let (mut images, mut skipped, mut notes) = (Vec::new(), SkippedImages::default(), document.notes());
+    let (mut unlisted, mut rounded, mut has_other_size) = (Vec::new(), Vec::new(), false);
     for (ix, entry) in document.frames.iter().enumerate() {
         if ix > 0 && document.frames[ix - 1].file_path == entry.file_path {
             skipped.unusable.push((entry.file_path.clone(), "listed twice, only the first entry is used".to_owned()));
+            continue;
+        }
+        let listed = splits.get(normalized(&entry.file_path).as_str()).copied();
+        if !splits.is_empty() && listed.is_none() {
+            unlisted.push(entry.file_path.clone());
             continue;
         }
         let frame_error = |reason: String| file_error(format!("frame {:?}: {reason}", entry.file_path));
@@ -65,7 +99,12 @@ pub fn read(path: &Path) -> Result<Dataset, Error> {
         let poses = world_from_camera(&rows)
             .and_then(|pose| Ok((pose, depth_rows.map(|rows| self::world_from_camera(&rows)).transpose()?)));
         let (world_from_camera, depth_pose) = match poses {
-            Ok(poses) => poses,
+            Ok(((pose, is_rounded), depth_pose)) => {
+                if is_rounded {
+                    rounded.push(entry.file_path.clone());
+                }
+                (pose, depth_pose.map(|(pose, _)| pose))
+            }
             Err(reason) => {
                 skipped.broken.push((entry.file_path.clone(), reason));
                 continue;
@@ -82,7 +121,8 @@ pub fn read(path: &Path) -> Result<Dataset, Error> {
         }
         let camera = entry.camera.or(&document.camera);
         let intrinsics = camera.intrinsics(size_px).map_err(frame_error)?;
-        if notes.is_empty() && camera.size_px().is_some_and(|reported| reported != size_px) {
+        if !has_other_size && camera.size_px().is_some_and(|reported| reported != size_px) {
+            has_other_size = true;
             notes.push(format!(
                 "images are {}x{}, which differs from transforms.json; lens parameters are scaled",
                 size_px[0], size_px[1]
@@ -100,8 +140,24 @@ pub fn read(path: &Path) -> Result<Dataset, Error> {
                 meters_per_count,
                 world_from_camera: depth_pose.unwrap_or(world_from_camera),
             }),
-            mask_path: entry.mask_path.as_ref().map(|name| folder.join(name)),
+            mask_path: entry
+                .mask_path
+                .as_ref()
+                .map(|name| find_image(&folder, name).unwrap_or_else(|| folder.join(name))),
+            listed,
         });
+    }
+    let names: BTreeSet<String> = document.frames.iter().map(|entry| normalized(&entry.file_path)).collect();
+    let absent: Vec<String> = splits.keys().filter(|name| !names.contains(*name)).cloned().collect();
+    for (names, what) in [
+        (unlisted, "not in any of the lists train_filenames, val_filenames and test_filenames, and not used"),
+        (absent, "in these lists, but has no frame"),
+        (rounded, "at poses with rounded numbers; the nearest rotation is used, which may be wrong by 0.1 degrees"),
+    ] {
+        if !names.is_empty() {
+            let (images, verb) = plural(names.len(), "image");
+            notes.push(format!("{images} {verb} {what}: {}", first_names(&names)));
+        }
     }
     let n_missing_depth = document.frames.iter().filter(|entry| entry.lacks_depth(&folder)).count();
     if n_missing_depth > 0 {
@@ -111,13 +167,75 @@ pub fn read(path: &Path) -> Result<Dataset, Error> {
     skipped.dataset(&folder, images, notes)
 }
 
-/// The whole file. Unknown keys are ignored.
+/// The whole file.
 #[derive(Deserialize)]
 struct Document {
     frames: Vec<FrameEntry>,
     depth_unit_scale_factor: Option<f64>,
+    #[serde(default)]
+    train_filenames: Vec<String>,
+    #[serde(default)]
+    val_filenames: Vec<String>,
+    #[serde(default)]
+    test_filenames: Vec<String>,
+    ply_file_path: Option<String>,
     #[serde(flatten)]
     camera: CameraEntry,
+    #[serde(flatten)]
+    other: BTreeMap<String, Value>,
+}
+
+impl Document {
+    /// The split of each listed image; empty if the file has no lists. The keys are [`normalized`]. Without test images,
+    /// the validation images are the test images, as they are scored in nerfstudio.
+    fn splits(&self) -> Result<HashMap<String, ListedSplit>, String> {
+        let validation = if self.test_filenames.is_empty() { ListedSplit::Test } else { ListedSplit::Validation };
+        let mut splits = HashMap::new();
+        for (list, names, split) in [
+            ("train_filenames", &self.train_filenames, ListedSplit::Train),
+            ("val_filenames", &self.val_filenames, validation),
+            ("test_filenames", &self.test_filenames, ListedSplit::Test),
+        ] {
+            for name in names {
+                if let Some((other_list, other)) = splits.insert(normalized(name), (list, split))
+                    && other != split
+                {
+                    return Err(format!("{name:?} is in both {other_list} and {list}"));
+                }
+            }
+        }
+        if self.train_filenames.is_empty() && !splits.is_empty() {
+            for entry in &self.frames {
+                splits.entry(normalized(&entry.file_path)).or_insert(("train_filenames", ListedSplit::Train));
+            }
+        }
+        Ok(splits.into_iter().map(|(name, (_, split))| (name, split)).collect())
+    }
+
+    /// Notes about keys that are not used.
+    fn notes(&self) -> Vec<String> {
+        let mut notes = Vec::new();
+        if let Some(file) = &self.ply_file_path {
+            notes.push(format!("the points in ply_file_path ({file:?}) are not used; training starts without them"));
+        }
+        let unknown = |keys: &BTreeMap<String, Value>| -> Vec<String> {
+            keys.keys().filter(|key| !UNUSED.contains(&key.as_str())).map(|key| format!("{key:?}")).collect()
+        };
+        let of_file = unknown(&self.other);
+        let of_frames: BTreeSet<String> = self.frames.iter().flat_map(|entry| unknown(&entry.other)).collect();
+        for (keys, place) in [(of_file, ""), (of_frames.into_iter().collect(), " of frames")] {
+            if !keys.is_empty() {
+                notes.push(format!("unknown keys{place} are not used: {}", first_names(&keys)));
+            }
+        }
+        notes
+    }
+}
+
+/// A path in the form in which paths are compared: with slashes, and without `./` at its start.
+fn normalized(path: &str) -> String {
+    let path = path.replace('\\', "/");
+    path.strip_prefix("./").unwrap_or(&path).to_owned()
 }
 
 /// One frame. Lens parameters of the frame override the common ones.
@@ -131,6 +249,8 @@ struct FrameEntry {
     depth_transform_matrix: Option<Matrix>,
     #[serde(flatten)]
     camera: CameraEntry,
+    #[serde(flatten)]
+    other: BTreeMap<String, Value>,
 }
 
 /// Rows of a pose; `None` where the number is not finite.
@@ -155,6 +275,8 @@ struct CameraEntry {
     #[serde(default, deserialize_with = "deserialize_finite")]
     camera_angle_x: Option<f64>,
     #[serde(default, deserialize_with = "deserialize_finite")]
+    camera_angle_y: Option<f64>,
+    #[serde(default, deserialize_with = "deserialize_finite")]
     k1: Option<f64>,
     #[serde(default, deserialize_with = "deserialize_finite")]
     k2: Option<f64>,
@@ -162,6 +284,10 @@ struct CameraEntry {
     k3: Option<f64>,
     #[serde(default, deserialize_with = "deserialize_finite")]
     k4: Option<f64>,
+    #[serde(default, deserialize_with = "deserialize_finite")]
+    k5: Option<f64>,
+    #[serde(default, deserialize_with = "deserialize_finite")]
+    k6: Option<f64>,
     #[serde(default, deserialize_with = "deserialize_finite")]
     p1: Option<f64>,
     #[serde(default, deserialize_with = "deserialize_finite")]
@@ -191,10 +317,11 @@ fn rows_of(matrix: &Matrix) -> Result<[f64; 16], String> {
         .map_err(|rows: Vec<f64>| format!("transform_matrix has {} numbers, expected 4 rows of 4", rows.len()))
 }
 
-/// Converts an OpenGL camera pose to our convention.
-fn world_from_camera(rows: &[f64; 16]) -> Result<Transform, String> {
-    let world_from_opengl = transform::from_rows(rows).map_err(|error| error.to_string())?;
-    Ok(world_from_opengl * opengl_from_camera())
+/// Converts an OpenGL camera pose to our convention. Also returns whether its numbers are rounded.
+fn world_from_camera(rows: &[f64; 16]) -> Result<(Transform, bool), String> {
+    let (world_from_opengl, is_rounded) = transform::from_rounded_rows(rows)
+        .map_err(|error| format!("{error}; if the numbers were rounded, write at least four decimals"))?;
+    Ok((world_from_opengl * opengl_from_camera(), is_rounded))
 }
 
 /// Largest absolute coordinate of a pose, if it exceeds the maximum.
@@ -222,10 +349,13 @@ impl CameraEntry {
             cx: self.cx.or(common.cx),
             cy: self.cy.or(common.cy),
             camera_angle_x: self.camera_angle_x.or(common.camera_angle_x),
+            camera_angle_y: self.camera_angle_y.or(common.camera_angle_y),
             k1: self.k1.or(common.k1),
             k2: self.k2.or(common.k2),
             k3: self.k3.or(common.k3),
             k4: self.k4.or(common.k4),
+            k5: self.k5.or(common.k5),
+            k6: self.k6.or(common.k6),
             p1: self.p1.or(common.p1),
             p2: self.p2.or(common.p2),
             is_fisheye: self.is_fisheye.or(common.is_fisheye),
@@ -242,20 +372,54 @@ impl CameraEntry {
     fn intrinsics(&self, image_px: [u32; 2]) -> Result<Intrinsics, String> {
         let size_px = self.size_px().unwrap_or(image_px);
         let [width, height] = size_px.map(f64::from);
-        let from_angle = || self.camera_angle_x.map(|angle_rad| 0.5 * width / (0.5 * angle_rad).tan());
-        let focal_x = self.fl_x.or_else(from_angle).ok_or("no focal length: neither fl_x nor camera_angle_x")?;
+        let focal_px = |given: (&str, Option<f64>), angle: (&str, Option<f64>), side_px: f64| {
+            let from_angle = angle.1.map(|angle_rad| 0.5 * side_px / (0.5 * angle_rad).tan());
+            match (given.1, from_angle) {
+                // Angles are usually written with fewer digits.
+                (Some(focal_px), Some(from_angle)) if (from_angle / focal_px - 1.0).abs() > MAX_FOCAL_DIFFERENCE => {
+                    Err(format!(
+                        "{} is {focal_px}, but {} means {from_angle:.1} for {side_px} pixels; remove the wrong one",
+                        given.0, angle.0
+                    ))
+                }
+                (focal_px, from_angle) => Ok(focal_px.or(from_angle)),
+            }
+        };
+        let focal_x = focal_px(("fl_x", self.fl_x), ("camera_angle_x", self.camera_angle_x), width)?;
+        let focal_y = focal_px(("fl_y", self.fl_y), ("camera_angle_y", self.camera_angle_y), height)?;
+        let focal_x = focal_x.ok_or("no focal length: neither fl_x nor camera_angle_x")?;
         let reported = Intrinsics {
             size_px,
-            focal_px: [focal_x, self.fl_y.unwrap_or(focal_x)],
+            focal_px: [focal_x, focal_y.unwrap_or(focal_x)],
             principal_px: [self.cx.unwrap_or(0.5 * width), self.cy.unwrap_or(0.5 * height)],
             lens: self.lens()?,
             rectified: false,
         };
         reported.validate().map_err(|error| error.to_string())?;
+        if let Some((name, value)) = self.implausible(size_px) {
+            return Err(format!(
+                "{name} is {value:e}, which is implausible for {} x {} pixels",
+                size_px[0], size_px[1]
+            ));
+        }
         Ok(reported.resized(image_px))
     }
 
+    /// A focal length or principal point that no camera has: such as the result of a division by almost zero.
+    fn implausible(&self, [width, height]: [u32; 2]) -> Option<(&'static str, f64)> {
+        let longest_px = f64::from(width.max(height));
+        let focal = [("fl_x", self.fl_x), ("fl_y", self.fl_y)].map(|(name, value)| (name, value, 1e3 * longest_px));
+        let center = [("cx", self.cx), ("cy", self.cy)].map(|(name, value)| (name, value, 10.0 * longest_px));
+        let mut all = focal.into_iter().chain(center);
+        all.find_map(|(name, value, max)| value.filter(|value| value.abs() > max).map(|value| (name, value)))
+    }
+
     fn lens(&self) -> Result<Lens, String> {
+        for (name, value) in [("k5", self.k5), ("k6", self.k6)] {
+            if value.is_some_and(|value| value != 0.0) {
+                return Err(format!("{name} is not 0, but only k1 to k4, p1 and p2 are supported"));
+            }
+        }
         let [k1, k2, k3, k4, p1, p2] =
             [self.k1, self.k2, self.k3, self.k4, self.p1, self.p2].map(Option::unwrap_or_default);
         let fisheye = self.is_fisheye == Some(true);
@@ -277,14 +441,25 @@ impl CameraEntry {
     }
 }
 
-/// Finds the file with this name, or with this name plus one of the known extensions.
+/// Finds the file with this name, or with this name plus one of the known extensions. Windows programs write `\\` as
+/// separator.
 fn find_image(folder: &Path, name: &str) -> Option<PathBuf> {
-    let as_named = folder.join(name);
-    if as_named.is_file() {
-        return Some(as_named);
+    let with_slashes = name.replace('\\', "/");
+    for name in [name, &with_slashes] {
+        let as_named = folder.join(name);
+        if as_named.is_file() {
+            return Some(as_named);
+        }
+        for extension in EXTENSIONS {
+            for extension in [extension.to_owned(), extension.to_uppercase()] {
+                let path = folder.join(format!("{name}.{extension}"));
+                if path.is_file() {
+                    return Some(path);
+                }
+            }
+        }
     }
-    let candidates = EXTENSIONS.into_iter().map(|extension| folder.join(format!("{name}.{extension}")));
-    candidates.into_iter().find(|path| path.is_file())
+    None
 }
 
 /// Text of the source of an error, or of the error if it has no source.

@@ -4,10 +4,15 @@ use crate::Error;
 use crate::decode::decode_complete;
 use image::{DynamicImage, ImageReader};
 use kinematics::{Intrinsics, Stamp, Transform};
+use std::io::Read;
 use std::path::{Path, PathBuf};
 
 /// Maximum size of an image file.
 const MAX_IMAGE_BYTES: u64 = 1 << 30;
+/// Maximum number of pixels of a photo: 134 million. A small file can contain many more, if they are equal.
+const MAX_COLOR_PX: u64 = 1 << 27;
+/// Maximum number of pixels of a depth image: 34 million.
+const MAX_DEPTH_PX: u64 = 1 << 25;
 
 /// One posed photo on disk.
 #[derive(Clone, Debug, PartialEq)]
@@ -27,6 +32,19 @@ pub struct DatasetImage {
     pub depth: Option<DepthFile>,
     /// Image that is 0 at pixels that must not be used.
     pub mask_path: Option<PathBuf>,
+    /// The split to which the dataset assigns the image; `None` if it does not list splits.
+    pub listed: Option<ListedSplit>,
+}
+
+/// The use of an image according to its dataset.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum ListedSplit {
+    /// For training.
+    Train,
+    /// For decisions during training.
+    Validation,
+    /// For scores only.
+    Test,
 }
 
 /// A 16-bit depth image on disk.
@@ -50,6 +68,8 @@ pub struct LoadedImage {
     pub depth: Option<DepthImage>,
     /// Reason why depth is missing although the image has a depth file.
     pub depth_error: Option<String>,
+    /// Why the mask probably excludes other pixels than it was meant to.
+    pub mask_warning: Option<String>,
 }
 
 /// Decoded depth at its own size.
@@ -64,13 +84,20 @@ pub struct DepthImage {
 impl DatasetImage {
     /// Decodes the files of this image. If only the depth image fails to decode, the photo is still returned.
     pub fn load(&self) -> Result<LoadedImage, Error> {
-        let mut rgba = decode_file(&self.image_path)?.into_rgba8();
+        let mut rgba = decode_file(&self.image_path, MAX_COLOR_PX)?.into_rgba8();
         self.require_size(&self.image_path, [rgba.width(), rgba.height()])?;
         for pixel in rgba.pixels_mut() {
             pixel.0[3] = if pixel.0[3] == 0 { 0 } else { 255 };
         }
+        let mut mask_warning = None;
         if let Some(mask_path) = &self.mask_path {
-            let mask = decode_file(mask_path)?.into_luma8();
+            let mask = decode_file(mask_path, MAX_COLOR_PX)?;
+            if is_in_alpha(&mask) {
+                mask_warning = Some(format!(
+                    "{mask_path:?} is black everywhere, and only its alpha channel differs; write masks as gray images"
+                ));
+            }
+            let mask = mask.into_luma8();
             self.require_size(mask_path, [mask.width(), mask.height()])?;
             for (pixel, mask_pixel) in rgba.pixels_mut().zip(mask.pixels()) {
                 pixel.0[3] = if mask_pixel.0[0] == 0 { 0 } else { pixel.0[3] };
@@ -81,11 +108,11 @@ impl DatasetImage {
             Some(Ok(depth)) => (Some(depth), None),
             None => (None, None),
         };
-        Ok(LoadedImage { rgba_srgb: rgba.into_raw(), depth, depth_error })
+        Ok(LoadedImage { rgba_srgb: rgba.into_raw(), depth, depth_error, mask_warning })
     }
 
     fn load_depth(&self, file: &DepthFile) -> Result<DepthImage, Error> {
-        let DynamicImage::ImageLuma16(counts) = decode_file(&file.path)? else {
+        let DynamicImage::ImageLuma16(counts) = decode_file(&file.path, MAX_DEPTH_PX)? else {
             return Err(Error::NotDepth { path: file.path.clone() });
         };
         #[expect(clippy::cast_possible_truncation, reason = "f32 is more precise than sensors")]
@@ -105,14 +132,28 @@ impl DatasetImage {
     }
 }
 
+/// Whether a mask is black, but not equally transparent: it was made as transparency.
+fn is_in_alpha(mask: &DynamicImage) -> bool {
+    if !mask.color().has_alpha() {
+        return false;
+    }
+    let mask = mask.to_luma_alpha8();
+    let alpha = mask.pixels().next().map(|pixel| pixel.0[1]);
+    mask.pixels().all(|pixel| pixel.0[0] == 0) && mask.pixels().any(|pixel| Some(pixel.0[1]) != alpha)
+}
+
 /// Reads the width and height of an image from its header.
 pub(super) fn image_size_px(path: &Path) -> Result<[u32; 2], Error> {
     let size = open_image(path)?.into_dimensions().map_err(|source| decode_error(path, source))?;
     Ok(size.into())
 }
 
-fn decode_file(path: &Path) -> Result<DynamicImage, Error> {
+fn decode_file(path: &Path, max_px: u64) -> Result<DynamicImage, Error> {
     let bytes = files::read(path, MAX_IMAGE_BYTES).map_err(|source| Error::Open { path: path.to_owned(), source })?;
+    let got_px = image_size_px(path)?;
+    if u64::from(got_px[0]) * u64::from(got_px[1]) > max_px {
+        return Err(Error::TooManyPixels { path: path.to_owned(), got_px, max_px });
+    }
     decode_complete(&bytes, None).map_err(|source| decode_error(path, source))
 }
 
@@ -122,5 +163,22 @@ fn open_image(path: &Path) -> Result<ImageReader<std::io::BufReader<std::fs::Fil
 }
 
 fn decode_error(path: &Path, source: image::ImageError) -> Error {
+    if let Some(format) = unsupported_format(path) {
+        return Error::ImageFormat { path: path.to_owned(), format };
+    }
     Error::DatasetImage { path: path.to_owned(), source }
+}
+
+/// Name of the format of a file, if it is a known one that cannot be read.
+fn unsupported_format(path: &Path) -> Option<&'static str> {
+    let mut start = [0; 12];
+    files::open(path).ok()?.read_exact(&mut start).ok()?;
+    if start.starts_with(b"\x93NUMPY") {
+        return Some("NumPy");
+    }
+    match (&start[4..8], &start[8..]) {
+        (b"ftyp", b"avif" | b"avis") => Some("AVIF"),
+        (b"ftyp", b"heic" | b"heix" | b"hevc" | b"heim" | b"heis" | b"mif1" | b"msf1") => Some("HEIC"),
+        _ => None,
+    }
 }

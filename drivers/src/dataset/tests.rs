@@ -220,7 +220,7 @@ fn invalid_camera_error_names_frame() {
     assert!(error_after_replacing("\"fl_x\":5.0,", "").contains("no focal length"));
     assert!(
         error_after_replacing("\"aabb_scale\":16", "\"depth_unit_scale_factor\":0")
-            .contains("expected a number above 0")
+            .contains("expected a number from 1e-6 to 1")
     );
     assert!(error_after_replacing("\"frames\"", "\"frame\"").contains("missing field `frames`"));
     assert!(error_after_replacing("{", "").contains("not a recording (.mcap), a dataset folder or a transforms.json"));
@@ -294,7 +294,7 @@ fn tum_photos_interpolate_pose_and_use_nearest_depth() {
     let folder = tum_folder();
     let dataset = read(folder.path()).unwrap();
     assert_eq!((dataset.images.len(), dataset.n_missing, dataset.n_unusable), (3, 1, 1));
-    assert!(dataset.notes.iter().any(|note| note.contains("rgb/9.000000.png (no pose within 20 ms)")));
+    assert!(dataset.notes.iter().any(|note| note.contains("rgb/9.000000.png (its time is outside the poses)")));
     assert!(dataset.notes.contains(&"1 photo has no depth image within 20 ms".to_owned()), "{:?}", dataset.notes);
     let second = &dataset.images[1];
     assert_eq!(second.stamp, Stamp(1_100_000_000));
@@ -330,10 +330,10 @@ fn broken_tum_list_error_names_line() {
     std::fs::write(folder.path().join("rgb.txt"), "# list\nnoon rgb/1.png\n").unwrap();
     assert!(read_error(&folder).contains("line 2: \"noon\" is not a time in seconds"));
     std::fs::write(folder.path().join("rgb.txt"), "1.0\n").unwrap();
-    assert!(read_error(&folder).contains("the time is not followed by a file name"));
+    assert!(read_error(&folder).contains("line 1: nothing follows the time"));
     std::fs::write(folder.path().join("rgb.txt"), "1.0 rgb/1.000000.png\n").unwrap();
     std::fs::write(folder.path().join("groundtruth.txt"), "1.0 nan 0 0 0 0 0 1\n").unwrap();
-    assert!(read_error(&folder).contains("no pose within 20 ms"), "an invalid pose is skipped");
+    assert!(read_error(&folder).contains("line 1: the pose is not finite"), "{}", read_error(&folder));
     std::fs::write(folder.path().join("groundtruth.txt"), "0.99 0 0 0 0 0 0 0\n1.0 0 0 0 0 0 0 1\n").unwrap();
     assert_eq!(read(folder.path()).unwrap().images.len(), 1);
 }
@@ -348,4 +348,260 @@ fn tum_extreme_stamps_and_poses_are_not_matched() {
     let dataset = read(folder.path()).unwrap();
     assert_eq!((dataset.images.len(), dataset.n_unusable), (1, 1));
     assert!(dataset.images[0].depth.is_none());
+}
+
+#[test]
+fn listed_splits_are_kept_and_unlisted_images_left_out() {
+    let (folder, mut document) = small_folder();
+    document["val_filenames"] = json!(["./a.png"]);
+    write_transforms(&folder, &document);
+    let listed = || read(folder.path()).unwrap().images.iter().map(|image| image.listed).collect::<Vec<_>>();
+    let [train, validation, test] = [ListedSplit::Train, ListedSplit::Validation, ListedSplit::Test].map(Some);
+    assert_eq!(listed(), [test, train], "nerfstudio scores the validation images, if there are no test images");
+    document["test_filenames"] = json!(["b.png", "gone.png"]);
+    write_transforms(&folder, &document);
+    assert_eq!(listed(), [validation, test]);
+    let notes = read(folder.path()).unwrap().notes;
+    assert_eq!(notes, ["1 image is in these lists, but has no frame: gone.png"]);
+    document["val_filenames"] = json!([]);
+    document["train_filenames"] = json!(["b.png"]);
+    document["test_filenames"] = json!([]);
+    write_transforms(&folder, &document);
+    assert_eq!(listed(), [train]);
+    let notes = read(folder.path()).unwrap().notes;
+    assert!(notes[0].starts_with("1 image is not in any of the lists") && notes[0].ends_with(": a.png"), "{notes:?}");
+    document["test_filenames"] = json!(["b.png"]);
+    write_transforms(&folder, &document);
+    assert!(read_error(&folder).ends_with(r#""b.png" is in both train_filenames and test_filenames"#));
+}
+
+#[test]
+fn rounded_poses_are_read_with_a_note() {
+    let (folder, mut document) = small_folder();
+    let round = |value: f64, decimals: f64| (value * decimals).round() / decimals;
+    let mut n_notes = [0; 2];
+    for angle_rad in (0..100).map(|ix| 0.01 * f64::from(ix)) {
+        let (sin, cos) = angle_rad.sin_cos();
+        for (n_notes, decimals) in n_notes.iter_mut().zip([1e3, 1e5]) {
+            let (sin, cos) = (round(sin, decimals), round(cos, decimals));
+            document["frames"][1]["transform_matrix"] =
+                json!([[cos, -sin, 0, 0], [sin, cos, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]);
+            write_transforms(&folder, &document);
+            let dataset = read(folder.path()).unwrap();
+            let expected = nalgebra::UnitQuaternion::from_axis_angle(&Vector3::z_axis(), angle_rad);
+            let rotation = dataset.images[0].world_from_camera.rotation * nerfstudio::opengl_from_camera().rotation;
+            assert!(rotation.angle_to(&expected) < 1.0 / decimals, "{rotation}");
+            *n_notes += dataset.notes.len();
+        }
+    }
+    assert!(n_notes[0] > 0 && n_notes[1] == 0, "{n_notes:?}");
+    document["frames"][1]["transform_matrix"][0][0] = json!(0.9);
+    write_transforms(&folder, &document);
+    let lost = &read(folder.path()).unwrap().data_losses[0];
+    assert!(lost.contains("not rigid") && lost.contains("write at least four decimals"), "{lost}");
+}
+
+#[test]
+fn files_of_windows_programs_are_read() {
+    let (folder, mut document) = small_folder();
+    std::fs::create_dir(folder.path().join("images")).unwrap();
+    for name in ["a", "b"] {
+        let at = |name: &str| folder.path().join(name);
+        std::fs::rename(at(&format!("{name}.png")), at(&format!("images/{name}.PNG"))).unwrap();
+    }
+    document["frames"][0]["file_path"] = json!("images\\b.PNG");
+    document["frames"][1]["file_path"] = json!(".\\images\\a");
+    std::fs::write(folder.path().join("transforms.json"), format!("\u{FEFF}{document}")).unwrap();
+    let dataset = read(folder.path()).unwrap();
+    assert_eq!((dataset.images.len(), dataset.notes.len()), (2, 0), "{:?}", dataset.notes);
+    document["frames"].as_array_mut().unwrap().truncate(1);
+    document["frames"][0]["file_path"] = json!("C:\\scan\\b.png");
+    write_transforms(&folder, &document);
+    assert!(read_error(&folder).ends_with("1 are missing, 0 cannot be used (such as C:\\scan\\b.png)"));
+}
+
+#[test]
+fn every_readable_image_format_is_read_and_others_are_named() {
+    let (folder, mut document) = small_folder();
+    let photo = RgbImage::from_fn(8, 6, |x, y| image::Rgb([10 * x as u8, 20 * y as u8, 30]));
+    for extension in ["png", "webp", "bmp", "tiff"] {
+        let name = format!("photo.{extension}");
+        photo.save(folder.path().join(&name)).unwrap();
+        document["frames"][1]["file_path"] = json!(name);
+        write_transforms(&folder, &document);
+        let dataset = read(folder.path()).unwrap();
+        let loaded = dataset.images[1].load().unwrap();
+        let rgb: Vec<u8> = loaded.rgba_srgb.chunks_exact(4).flat_map(|pixel| &pixel[..3]).copied().collect();
+        assert_eq!(&rgb, photo.as_raw(), "{extension}");
+    }
+    for (start, format) in [(&b"\0\0\0\x18ftypheic"[..], "HEIC"), (b"\0\0\0\x18ftypavif", "AVIF")] {
+        std::fs::write(folder.path().join("photo.png"), [start, &[0; 100]].concat()).unwrap();
+        document["frames"][1]["file_path"] = json!("photo.png");
+        write_transforms(&folder, &document);
+        let lost = &read(folder.path()).unwrap().data_losses[0];
+        assert!(lost.contains(&format!("is a {format} file")) && lost.contains("convert it"), "{lost}");
+    }
+    std::fs::write(folder.path().join("depth.npy"), b"\x93NUMPY\x01\0v\0{'descr': '<f4'}").unwrap();
+    document["frames"][0]["depth_file_path"] = json!("depth.npy");
+    document["frames"].as_array_mut().unwrap().truncate(1);
+    write_transforms(&folder, &document);
+    let why = read(folder.path()).unwrap().images[0].load().unwrap().depth_error.unwrap();
+    assert!(why.contains("depth.npy\" is a NumPy file") && why.contains("depth 16-bit PNG"), "{why}");
+}
+
+#[test]
+fn huge_depth_of_a_small_file_is_refused() {
+    let (folder, mut document) = small_folder();
+    save_counts(&folder.path().join("depth.png"), [8192, 4097], &vec![0; 8192 * 4097]);
+    document["frames"][0]["depth_file_path"] = json!("depth.png");
+    write_transforms(&folder, &document);
+    let dataset = read(folder.path()).unwrap();
+    let loaded = dataset.images[1].load().unwrap();
+    assert!(loaded.depth.is_none());
+    let why = loaded.depth_error.unwrap();
+    assert!(why.contains("has 8192x4097 pixels, at most 33554432 are read"), "{why}");
+}
+
+#[test]
+fn mask_in_the_alpha_channel_is_named() {
+    let (folder, mut document) = small_folder();
+    let mask = image::RgbaImage::from_fn(8, 6, |x, _| image::Rgba([0, 0, 0, if x < 4 { 0 } else { 255 }]));
+    mask.save(folder.path().join("mask.png")).unwrap();
+    document["frames"][1]["mask_path"] = json!("mask.png");
+    write_transforms(&folder, &document);
+    let loaded = read(folder.path()).unwrap().images[0].load().unwrap();
+    assert!(
+        loaded.mask_warning.unwrap().contains("mask.png\" is black everywhere, and only its alpha channel differs")
+    );
+}
+
+/// Feeds each key of the tables in docs/reference/datasets.md alone.
+#[test]
+fn keys_of_transforms_json_are_used_refused_or_named_as_documented() {
+    let documented = include_str!("../../../docs/reference/datasets.md");
+    let rows: Vec<[&str; 3]> = documented
+        .lines()
+        .filter_map(|line| {
+            line.strip_prefix("| `")?
+                .trim_end_matches(" |")
+                .split('|')
+                .map(str::trim)
+                .collect::<Vec<_>>()
+                .try_into()
+                .ok()
+        })
+        .map(|[key, place, _, used]: [&str; 4]| [key.trim_end_matches('`'), place, used])
+        .collect();
+    assert!(rows.len() > 30, "{rows:?}");
+    for [key, place, use_of_key] in rows {
+        let (folder, mut document) = small_folder();
+        RgbImage::new(8, 6).save(folder.path().join("c.png")).unwrap();
+        save_counts(&folder.path().join("depth.png"), [8, 6], &[1000; 48]);
+        document["frames"][1]["depth_file_path"] = json!("depth.png");
+        if let Some(axis) = key.strip_prefix("camera_angle_") {
+            document.as_object_mut().unwrap().remove(&format!("fl_{axis}"));
+            document[key] = json!(1.0);
+        }
+        let value = match key {
+            "frames" | "file_path" | "transform_matrix" => continue, // Nothing can be read without them.
+            "camera_model" => json!("OPENCV_FISHEYE"),
+            "is_fisheye" => json!(true),
+            "w" => json!(16),
+            "h" => json!(12),
+            "fl_x" | "fl_y" | "cx" | "cy" => json!(5.5),
+            "camera_angle_x" | "camera_angle_y" => json!(1.5),
+            "depth_file_path" => json!("gone.png"),
+            "mask_path" => json!("c.png"),
+            "depth_transform_matrix" => json!([[1, 0, 0, 1], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]),
+            "train_filenames" | "val_filenames" | "test_filenames" => json!(["a.png"]),
+            "ply_file_path" => json!("points.ply"),
+            _ => json!(0.01),
+        };
+        for place_of_key in ["file", "frame"].into_iter().filter(|one| place.contains(one)) {
+            write_transforms(&folder, &document);
+            let before = read(folder.path()).unwrap();
+            let mut changed = document.clone();
+            let target = if place_of_key == "file" { &mut changed } else { &mut changed["frames"][1] };
+            target[key] = value.clone();
+            write_transforms(&folder, &changed);
+            let after = read(folder.path());
+            let context = format!("{key} of a {place_of_key}: {use_of_key}: {after:?}");
+            let loaded = |dataset: &Dataset| {
+                let load = |image: &DatasetImage| image.load().map(|loaded| (loaded.rgba_srgb, loaded.depth)).ok();
+                (dataset.images.clone(), dataset.images.iter().map(load).collect::<Vec<_>>())
+            };
+            match use_of_key {
+                "yes" => assert!(after.is_ok_and(|after| loaded(&after) != loaded(&before)), "{context}"),
+                "refused" => assert!(after.unwrap_err().to_string().contains(key), "{context}"),
+                "no" => {
+                    let after = after.unwrap();
+                    assert_eq!((loaded(&after), &after.notes), (loaded(&before), &before.notes), "{context}");
+                }
+                "note" => {
+                    let after = after.unwrap();
+                    assert_eq!(loaded(&after), loaded(&before), "{context}");
+                    assert!(after.notes.iter().any(|note| note.contains(key)), "{context}");
+                }
+                other => panic!("unknown use {other:?}"),
+            }
+        }
+    }
+}
+
+#[test]
+fn tum_times_may_have_exponents() {
+    let folder = tum_folder();
+    let read_stamps = |list: &str| {
+        std::fs::write(folder.path().join("rgb.txt"), list).unwrap();
+        read(folder.path()).unwrap().images.iter().map(|image| image.stamp.0).collect::<Vec<_>>()
+    };
+    for time in ["1.100000", "+1.1", "1.1e0", "1.1e+00", "11E-1", "0.00011e4", "1100e-3", "1.100000000999"] {
+        assert_eq!(read_stamps(&format!("{time} rgb/1.100000.png\n")), [1_100_000_000], "{time}");
+    }
+    std::fs::write(
+        folder.path().join("groundtruth.txt"),
+        "1.305031e+09 0 0 0 0 0 0 1\n1.30503100002e+09 1 0 0 0 0 0 1\n",
+    )
+    .unwrap();
+    assert_eq!(read_stamps("1.305031000010000001e+09 rgb/1.100000.png\n"), [1_305_031_000_010_000_001]);
+    for time in ["1e", "e5", "1.2.3", "0x10", "inf", "nan", "1e40", "--1", "."] {
+        std::fs::write(folder.path().join("rgb.txt"), format!("{time} rgb/1.png\n")).unwrap();
+        assert!(read_error(&folder).contains("is not a time in seconds"), "{time}");
+    }
+}
+
+#[test]
+fn sparse_tum_poses_are_interpolated_but_not_over_gaps() {
+    let folder = tum_folder();
+    let write = |name: &str, text: String| std::fs::write(folder.path().join(name), text).unwrap();
+    let photo = |secs: f64| format!("{secs} rgb/1.000000.png\n");
+    // Poses at 20 Hz without those from 1.2 s to 1.3 s.
+    let poses = (0..20).filter(|ix| !(5..6).contains(ix)).map(|ix| f64::from(ix) * 0.05);
+    write("groundtruth.txt", poses.map(|secs| format!("{} {secs} 0 0 0 0 0 1\n", 1.0 + secs)).collect());
+    write("rgb.txt", photo(1.125) + &photo(1.225) + &photo(1.425));
+    let dataset = read(folder.path()).unwrap();
+    let xs: Vec<f64> = dataset.images.iter().map(|image| image.world_from_camera.translation.x).collect();
+    assert!(xs.len() == 2 && (xs[0] - 0.125).abs() < 1e-9 && (xs[1] - 0.425).abs() < 1e-9, "{xs:?}");
+    assert!(
+        dataset.notes.iter().any(|note| note.contains("before and after it are 100 ms apart, at most 75 ms")),
+        "{:?}",
+        dataset.notes
+    );
+}
+
+#[test]
+fn invalid_lines_and_repeated_times_of_tum_lists_are_named() {
+    let folder = tum_folder();
+    let poses = "0.99 0 0 0 0 0 0 1\n0.995 0 0 x 0 0 0 1\n1.0 1 0 0 0 0 0 1\n1.0 2 0 0 0 0 0 1\n1.005 0 0 0 0 0\n1.01 0 0 0 0 0 0 1";
+    std::fs::write(folder.path().join("groundtruth.txt"), poses).unwrap();
+    std::fs::write(folder.path().join("rgb.txt"), "1.0 rgb/1.000000.png\n1.1\n").unwrap();
+    let dataset = read(folder.path()).unwrap();
+    assert!((dataset.images[0].world_from_camera.translation.x - 1.0).abs() < 1e-9);
+    let expected = [
+        "rgb.txt: 1 line cannot be used: line 2: nothing follows the time",
+        "groundtruth.txt: 2 lines cannot be used: line 2: expected seven numbers tx ty tz qx qy qz qw after the time, \
+         line 5: expected seven numbers tx ty tz qx qy qz qw after the time",
+        "groundtruth.txt: 1 pose is not used, because another pose has the same time (are the times rounded?): line 4",
+    ];
+    assert_eq!(dataset.data_losses, expected);
 }

@@ -4,7 +4,7 @@
 //! benchmark.
 
 use super::posed_image::image_size_px;
-use super::{Dataset, DatasetImage, DepthFile, MAX_POSITION_M, SkippedImages};
+use super::{Dataset, DatasetImage, DepthFile, MAX_POSITION_M, SkippedImages, first_names, plural};
 use crate::Error;
 use kinematics::{Intrinsics, Lens, Stamp, Transform, transform};
 use nalgebra::{Quaternion, UnitQuaternion, Vector3};
@@ -17,8 +17,12 @@ const POSE_LIST: &str = "groundtruth.txt";
 /// Optional file with the lens parameters: `fx fy cx cy`, then optionally `k1 k2 p1 p2 k3`, with pixel centers at
 /// integers as in OpenCV.
 const CAMERA_FILE: &str = "calibration.txt";
-/// Maximum time between samples that are matched to each other.
+/// Maximum time between an image and its depth image or pose.
 const MAX_GAP_NANOS: i64 = 20_000_000;
+/// Maximum time between two poses that are interpolated, if poses are usually that far apart.
+const MAX_POSE_INTERVAL_NANOS: i64 = 110_000_000;
+/// Poses are not interpolated over a gap of more than this number of usual intervals.
+const MAX_USUAL_INTERVALS: f64 = 1.5;
 const METERS_PER_COUNT: f64 = 1.0 / 5000.0;
 
 /// Lens parameters of the cameras of the benchmark, by a part of the folder name: `fx fy cx cy`, then `k1 k2 p1 p2 k3`.
@@ -33,17 +37,19 @@ const CAMERAS: [(&str, [f64; 9]); 3] = [
 
 /// Reads a folder.
 ///
-/// Each photo gets the pose interpolated at its stamp and the depth image closest in time, both within 20 ms. Photos
-/// without a pose are skipped and counted. Lens parameters come from `calibration.txt`, else from the folder name.
+/// Each photo gets the depth image closest in time, within 20 ms, and the pose interpolated at its stamp between two poses
+/// that are at most 40 ms apart, or 1.5 times the usual interval of the poses, up to 110 ms. Photos without a pose and
+/// invalid lines are skipped and counted. Lens parameters come from `calibration.txt`, else from the folder name.
 pub fn read(folder: &Path) -> Result<Dataset, Error> {
     let camera = camera_of(folder)?;
-    let colors = stamped_names(folder, COLOR_LIST)?;
+    let mut skipped = SkippedImages::default();
+    let colors = stamped_names(folder, COLOR_LIST, &mut skipped)?;
     let depths = match folder.join(DEPTH_LIST).is_file() {
-        true => stamped_names(folder, DEPTH_LIST)?,
+        true => stamped_names(folder, DEPTH_LIST, &mut skipped)?,
         false => Vec::new(),
     };
-    let poses = Poses::read(folder)?;
-    let (mut images, mut skipped) = (Vec::new(), SkippedImages::default());
+    let poses = Poses::read(folder, &mut skipped)?;
+    let mut images = Vec::new();
     let mut n_without_depth = 0;
     for (stamp, name) in colors {
         let image_path = folder.join(&name);
@@ -51,21 +57,33 @@ pub fn read(folder: &Path) -> Result<Dataset, Error> {
             skipped.missing.push(name);
             continue;
         }
-        let Some(world_from_camera) = poses.at(stamp) else {
-            skipped.unusable.push((name, "no pose within 20 ms".to_owned()));
-            continue;
+        let world_from_camera = match poses.at(stamp) {
+            Ok(pose) => pose,
+            Err(reason) => {
+                skipped.unusable.push((name, reason));
+                continue;
+            }
         };
         let Ok(size_px) = image_size_px(&image_path) else {
             skipped.broken.push((name, "not an image".to_owned()));
             continue;
         };
         let depth = nearest(&depths, stamp).and_then(|(depth_stamp, depth_name)| {
-            let (path, pose) = (folder.join(depth_name), poses.at(*depth_stamp)?);
+            let (path, pose) = (folder.join(depth_name), poses.at(*depth_stamp).ok()?);
             path.is_file().then_some(DepthFile { path, meters_per_count: METERS_PER_COUNT, world_from_camera: pose })
         });
         n_without_depth += usize::from(depth.is_none());
         let intrinsics = Intrinsics { size_px, ..camera.clone() };
-        images.push(DatasetImage { name, intrinsics, world_from_camera, stamp, image_path, depth, mask_path: None });
+        images.push(DatasetImage {
+            name,
+            intrinsics,
+            world_from_camera,
+            stamp,
+            image_path,
+            depth,
+            mask_path: None,
+            listed: None,
+        });
     }
     let notes = match n_without_depth {
         0 => Vec::new(),
@@ -109,39 +127,72 @@ fn camera_by_name(folder: &Path) -> Option<[f64; 9]> {
     CAMERAS.iter().find(|(part, _)| name.contains(part)).map(|(_, numbers)| *numbers)
 }
 
-/// Lines of a list, each split into its stamp and the words after it, sorted by time.
-fn stamped_lines(folder: &Path, list: &str) -> Result<Vec<(Stamp, Vec<String>)>, Error> {
+/// One line of a list.
+struct Line {
+    /// Number in the file, from 1.
+    number: usize,
+    stamp: Stamp,
+    words: Vec<String>,
+}
+
+/// Lines of a list, sorted by time. Invalid lines are skipped.
+///
+/// # Errors
+/// If the file cannot be read, or no line is valid.
+fn stamped_lines(folder: &Path, list: &str, skipped: &mut SkippedImages) -> Result<Vec<Line>, Error> {
     let path = folder.join(list);
     let text = files::read_text(&path).map_err(|source| Error::Open { path: path.clone(), source })?;
     let mut lines = Vec::new();
+    let mut invalid = Vec::new();
     for (line_ix, line) in text.lines().enumerate() {
+        let number = line_ix + 1;
         let mut words = line.split_whitespace().map(str::to_owned);
         let Some(first) = words.next().filter(|word| !word.starts_with('#')) else { continue };
-        let line_error =
-            |what: &str| Error::DatasetFile { path: path.clone(), reason: format!("line {}: {what}", line_ix + 1) };
-        let stamp = stamp_of(&first).ok_or_else(|| line_error(&format!("{first:?} is not a time in seconds")))?;
-        let rest: Vec<String> = words.collect();
-        if rest.is_empty() {
-            return Err(line_error("the time is not followed by a file name"));
+        let words: Vec<String> = words.collect();
+        match stamp_of(&first) {
+            None => invalid.push(format!("line {number}: {first:?} is not a time in seconds")),
+            Some(_) if words.is_empty() => invalid.push(format!("line {number}: nothing follows the time")),
+            Some(stamp) => lines.push(Line { number, stamp, words }),
         }
-        lines.push((stamp, rest));
     }
-    lines.sort_by_key(|(stamp, _)| *stamp);
+    if let (true, Some(first)) = (lines.is_empty(), invalid.first()) {
+        return Err(Error::DatasetFile { path, reason: first.clone() });
+    }
+    skipped.lines(list, &invalid);
+    lines.sort_by_key(|line| line.stamp);
     Ok(lines)
 }
 
-fn stamped_names(folder: &Path, list: &str) -> Result<Vec<(Stamp, String)>, Error> {
-    let lines = stamped_lines(folder, list)?;
-    Ok(lines.into_iter().map(|(stamp, words)| (stamp, words.join(" "))).collect())
+fn stamped_names(folder: &Path, list: &str, skipped: &mut SkippedImages) -> Result<Vec<(Stamp, String)>, Error> {
+    let lines = stamped_lines(folder, list, skipped)?;
+    Ok(lines.into_iter().map(|line| (line.stamp, line.words.join(" "))).collect())
 }
 
-/// Parses seconds since 1970 with decimals. Uses two integers because f64 would round to a quarter of a microsecond.
+/// Parses a decimal number of seconds, such as `1305031102.175304` or `1.305031102175304e+09`, and rounds it down to a
+/// nanosecond. Does not use f64, which would round to a quarter of a microsecond.
 fn stamp_of(word: &str) -> Option<Stamp> {
-    let (integer, decimals) = word.split_once('.').unwrap_or((word, ""));
-    let secs: i64 = integer.parse().ok()?;
-    let nine_digits: String = decimals.chars().chain(std::iter::repeat('0')).take(9).collect();
-    let nanos: i64 = nine_digits.chars().all(|digit| digit.is_ascii_digit()).then(|| nine_digits.parse().ok())??;
-    Some(Stamp(secs.checked_mul(1_000_000_000)?.checked_add(nanos)?))
+    const NANOS_EXPONENT: i64 = 9;
+    let (mantissa, exponent) = word.split_once(['e', 'E']).unwrap_or((word, "0"));
+    let (sign, mantissa) = match mantissa.strip_prefix('-') {
+        Some(rest) => (-1, rest),
+        None => (1, mantissa.strip_prefix('+').unwrap_or(mantissa)),
+    };
+    let (integer, decimals) = mantissa.split_once('.').unwrap_or((mantissa, ""));
+    let digits = [integer, decimals].concat();
+    if digits.is_empty() || !digits.bytes().all(|digit| digit.is_ascii_digit()) {
+        return None;
+    }
+    // Number of digits before the decimal point of the number of nanoseconds.
+    let n_digits = i64::try_from(integer.len()).ok()? + exponent.parse::<i32>().map(i64::from).ok()? + NANOS_EXPONENT;
+    let zeros = digits.bytes().take_while(|digit| *digit == b'0').count();
+    let n_significant = n_digits - i64::try_from(zeros).ok()?;
+    if zeros == digits.len() || n_significant <= 0 {
+        return Some(Stamp(0));
+    }
+    let n_significant = usize::try_from(n_significant).ok().filter(|n| *n < 20)?;
+    let padded = digits.bytes().skip(zeros).chain(std::iter::repeat(b'0')).take(n_significant);
+    let nanos = padded.fold(0_i128, |nanos, digit| 10 * nanos + i128::from(digit - b'0'));
+    i64::try_from(sign * nanos).ok().map(Stamp)
 }
 
 /// Entry closest in time, within the maximum gap.
@@ -153,43 +204,85 @@ fn nearest<T>(entries: &[(Stamp, T)], stamp: Stamp) -> Option<&(Stamp, T)> {
 }
 
 /// Trajectory of the color camera.
-struct Poses(Vec<(Stamp, Transform)>);
+struct Poses {
+    poses: Vec<(Stamp, Transform)>,
+    /// Maximum time between two poses that are interpolated.
+    max_interval_nanos: i64,
+}
 
 impl Poses {
-    fn read(folder: &Path) -> Result<Self, Error> {
-        let path = folder.join(POSE_LIST);
-        let poses = stamped_lines(folder, POSE_LIST)?.into_iter().filter_map(|(stamp, words)| {
-            let line_error = |what: &str| Error::DatasetFile {
-                path: path.clone(),
-                reason: format!("pose at {:.4} s: {what}", stamp.0 as f64 * 1e-9),
-            };
-            let numbers: Vec<f64> = words.iter().filter_map(|word| word.parse().ok()).collect();
-            let [x, y, z, qx, qy, qz, qw] = numbers[..] else {
-                return Some(Err(line_error("expected tx ty tz qx qy qz qw")));
-            };
-            let rotation = Quaternion::new(qw, qx, qy, qz);
-            // The comparisons are written so that NaN fails them.
-            let is_near = [x, y, z].iter().all(|along| along.abs() <= MAX_POSITION_M);
-            if !(is_near && (rotation.norm() - 1.0).abs() <= 0.01) {
-                log::warn!("{}", line_error("skipped: not finite, too far away, or the quaternion is not of length 1"));
-                return None;
+    fn read(folder: &Path, skipped: &mut SkippedImages) -> Result<Self, Error> {
+        let mut poses: Vec<(Stamp, Transform)> = Vec::new();
+        let (mut invalid, mut repeated) = (Vec::new(), Vec::new());
+        for Line { number, stamp, words } in stamped_lines(folder, POSE_LIST, skipped)? {
+            match pose_of(&words) {
+                Err(reason) => invalid.push(format!("line {number}: {reason}")),
+                Ok(pose) if poses.last().is_some_and(|(last, other)| *last == stamp && *other != pose) => {
+                    repeated.push(format!("line {number}"));
+                }
+                Ok(pose) => poses.push((stamp, pose)),
             }
-            let rotation = UnitQuaternion::new_normalize(rotation);
-            Some(Ok((stamp, Transform::from_parts(Vector3::new(x, y, z).into(), rotation))))
-        });
-        Ok(Self(poses.collect::<Result<_, _>>()?))
+        }
+        if let (true, Some(first)) = (poses.is_empty(), invalid.first()) {
+            return Err(Error::DatasetFile { path: folder.join(POSE_LIST), reason: first.clone() });
+        }
+        skipped.lines(POSE_LIST, &invalid);
+        if !repeated.is_empty() {
+            let (what, verb) = plural(repeated.len(), "pose");
+            skipped.lost.push(format!(
+                "{POSE_LIST}: {what} {verb} not used, because another pose has the same time (are the times rounded?): {}",
+                first_names(&repeated)
+            ));
+        }
+        Ok(Self { max_interval_nanos: max_interval_nanos(&poses), poses })
     }
 
-    /// Pose at a stamp, interpolated between two poses that are both within the maximum gap.
-    fn at(&self, stamp: Stamp) -> Option<Transform> {
-        let after_ix = self.0.partition_point(|(other, _)| *other < stamp);
-        let after = self.0.get(after_ix).filter(|(other, _)| other.nanos_since(stamp) <= MAX_GAP_NANOS)?;
-        if after.0 == stamp {
-            return Some(after.1);
+    /// Pose at a stamp, interpolated between two poses. The error is the reason why there is none.
+    fn at(&self, stamp: Stamp) -> Result<Transform, String> {
+        let after_ix = self.poses.partition_point(|(other, _)| *other < stamp);
+        let after = self.poses.get(after_ix);
+        if let Some((after_stamp, pose)) = after
+            && *after_stamp == stamp
+        {
+            return Ok(*pose);
         }
-        let before =
-            self.0.get(after_ix.checked_sub(1)?).filter(|(other, _)| stamp.nanos_since(*other) <= MAX_GAP_NANOS)?;
-        let frac = (stamp.0 - before.0.0) as f64 / (after.0.0 - before.0.0) as f64;
-        Some(transform::interpolate(&before.1, &after.1, frac))
+        let (Some(after), Some(before)) = (after, after_ix.checked_sub(1).map(|ix| &self.poses[ix])) else {
+            return Err("its time is outside the poses".to_owned());
+        };
+        let interval_nanos = after.0.nanos_since(before.0);
+        let is_near = [stamp.nanos_since(before.0), after.0.nanos_since(stamp)].iter().all(|gap| *gap <= MAX_GAP_NANOS);
+        if !is_near && interval_nanos > self.max_interval_nanos {
+            let [interval_millis, max_millis] =
+                [interval_nanos, self.max_interval_nanos].map(|nanos| nanos / 1_000_000);
+            return Err(format!(
+                "the poses before and after it are {interval_millis} ms apart, at most {max_millis} ms are interpolated"
+            ));
+        }
+        let frac = (stamp.0 - before.0.0) as f64 / interval_nanos as f64;
+        Ok(transform::interpolate(&before.1, &after.1, frac))
     }
+}
+
+/// Poses that are regularly far apart are interpolated, but a gap in dense poses is not, because tracking was lost.
+fn max_interval_nanos(poses: &[(Stamp, Transform)]) -> i64 {
+    let mut intervals: Vec<i64> = poses.windows(2).map(|pair| pair[1].0.nanos_since(pair[0].0)).collect();
+    intervals.sort_unstable();
+    let usual = intervals.get(intervals.len() / 2).copied().unwrap_or_default();
+    #[expect(clippy::cast_possible_truncation, reason = "the cast saturates")]
+    let max = (MAX_USUAL_INTERVALS * usual as f64) as i64;
+    max.clamp(2 * MAX_GAP_NANOS, MAX_POSE_INTERVAL_NANOS)
+}
+
+fn pose_of(words: &[String]) -> Result<Transform, &'static str> {
+    let numbers: Option<Vec<f64>> = words.iter().map(|word| word.parse().ok()).collect();
+    let Some([x, y, z, qx, qy, qz, qw]) = numbers.as_deref() else {
+        return Err("expected seven numbers tx ty tz qx qy qz qw after the time");
+    };
+    let rotation = Quaternion::new(*qw, *qx, *qy, *qz);
+    // The comparisons are written so that NaN fails them.
+    let is_near = [x, y, z].iter().all(|along| along.abs() <= MAX_POSITION_M);
+    if !(is_near && (rotation.norm() - 1.0).abs() <= 0.01) {
+        return Err("the pose is not finite, too far away, or its quaternion is not of length 1");
+    }
+    Ok(Transform::from_parts(Vector3::new(*x, *y, *z).into(), UnitQuaternion::new_normalize(rotation)))
 }

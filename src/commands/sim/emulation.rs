@@ -217,7 +217,8 @@ impl EmulatedDevices {
         let mut descriptions = Vec::new();
         match rig.arm.driver {
             ArmDriver::Franka => {
-                let open = emulate_fci(track()?, robot_config(rig, &args.fci)?, Duration::ZERO, None)?;
+                let answer_wait = Duration::from_secs_f64(args.answer_wait / 1000.0);
+                let open = emulate_fci(track()?, robot_config(rig, &args.fci)?, answer_wait, None)?;
                 descriptions.push(format!("arm: a Franka controller at {}, FCI {}", open.address(), args.fci));
                 robot = Some(open);
             }

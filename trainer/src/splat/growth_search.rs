@@ -276,6 +276,21 @@ mod tests {
     }
 
     #[test]
+    fn search_waits_after_images_changed_and_survives_a_checkpoint() {
+        let steps = TrialSteps { search: 1000, search_pause: 300, ..TrialSteps::default() };
+        let mut search = GrowthSearch::new(true);
+        search.postpone(999, &steps);
+        assert_eq!(search.steps_left(900, &steps), 100, "before the first search, images may change");
+        search.postpone(1100, &steps);
+        assert_eq!(search.steps_left(1100, &steps), 300);
+        let mut resumed = GrowthSearch::new(true);
+        resumed.restore(search.saved());
+        assert_eq!(resumed.steps_left(1150, &steps), 250);
+        resumed.restore(GrowthSearch::new(false).saved());
+        assert_eq!(resumed.steps_left(1150, &steps), u64::MAX, "it is off");
+    }
+
+    #[test]
     fn every_image_is_in_one_fold() {
         let images = |n: i64| (0..n).map(|ix| ("camera".into(), Stamp(ix))).collect::<Vec<ImageId>>();
         let sizes = |n| folds(images(n)).iter().map(Vec::len).collect::<Vec<usize>>();

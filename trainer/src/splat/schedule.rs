@@ -71,3 +71,20 @@ impl Schedule {
         step.saturating_sub(self.start) as f64 / self.n_planned_steps.max(1) as f64
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn progress_counts_from_the_start_in_whole_periods() {
+        let at = |step| Schedule { step, start: 1000, ..Schedule::new(4000) }.completed_frac();
+        assert_eq!([at(500), at(1000), at(1199), at(1200), at(5000)], [0.0, 0.0, 0.025, 0.05, 1.0]);
+    }
+
+    #[test]
+    fn sh_degree_rises_to_three() {
+        let at = |step| Schedule { step, ..Schedule::new(4000) }.active_degree();
+        assert_eq!([0, 299, 300, 600, 899, 900, 5000].map(at), [0, 0, 1, 2, 2, 3, 3]);
+    }
+}

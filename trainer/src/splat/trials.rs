@@ -604,4 +604,13 @@ mod tests {
             assert_eq!(due(2 * TrialSteps::default().first_trial), Due::ReleaseValidation);
         }
     }
+
+    #[test]
+    fn arriving_keyframes_are_watched_only_for_gains() {
+        let watches = |cameras: CameraRefinement| {
+            SplatTrials::new(&cameras, CountPolicy::ToCap, TrialSteps::default()).watches_gains()
+        };
+        assert!(watches(CameraRefinement::AlwaysAndWatch(poses(), GAINS)));
+        assert!(!watches(CameraRefinement::AlwaysAndWatch(GAINS, poses())) && !watches(CameraRefinement::default()));
+    }
 }

@@ -183,8 +183,7 @@ impl TrainView {
 
     /// Returns `level`, or a finer level if a side of the image would be smaller than a tile.
     pub(crate) fn clamped(&self, level: u32) -> usize {
-        let [width, height] = self.keyframe.size_px;
-        level.min((width.min(height) / TILE_PX).max(1).ilog2()) as usize
+        clamped(level, self.keyframe.size_px)
     }
 
     /// Size of the image at a level, pixels.
@@ -272,6 +271,11 @@ impl LevelImages {
     pub(crate) fn size_px(&self) -> [u32; 2] {
         self.camera.size_px
     }
+}
+
+/// See [`TrainView::clamped`].
+fn clamped(level: u32, [width, height]: [u32; 2]) -> usize {
+    level.min((width.min(height) / TILE_PX).max(1).ilog2()) as usize
 }
 
 /// Whether the depth of two versions of a keyframe, seen from its color camera, is the same.
@@ -367,4 +371,21 @@ fn downscaled_depth(keyframe: &Keyframe, size_px: [u32; 2], level: u32) -> Arc<[
 /// The error if a view is used before its image is uploaded.
 fn not_uploaded() -> Error {
     Error::internal("a view was used before its image was uploaded")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn no_side_of_a_level_is_smaller_than_a_tile() {
+        for size_px in [[640, 480], [33, 1000], [17, 17], [5, 9]] {
+            for level in 0..8 {
+                let clamped = clamped(level, size_px);
+                let shorter_px = size_px[0].min(size_px[1]);
+                assert!(clamped == 0 || shorter_px >> clamped >= TILE_PX, "{size_px:?} at {level}");
+                assert!(clamped == level as usize || shorter_px >> (clamped + 1) < TILE_PX, "{size_px:?} at {level}");
+            }
+        }
+    }
 }

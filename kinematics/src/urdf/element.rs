@@ -1,0 +1,174 @@
+//! Elements and attributes of a robot description, and notes about those that are not used.
+
+use super::MAX_BYTES;
+use crate::Error;
+use roxmltree::{Document, Node, ParsingOptions};
+use std::collections::BTreeMap;
+
+const MAX_NODES: u32 = 1 << 20;
+/// The parser's time grows with the square of an element's attributes, and with the cube of nested namespaces.
+const MAX_ATTRIBUTES: usize = 2000;
+const MAX_NAMESPACES: usize = 100;
+const MAX_NOTES: usize = 100;
+
+/// Parses XML whose size and structure are limited.
+pub(super) fn parse(xml: &str) -> Result<Document<'_>, Error> {
+    let syntax = |why: String| Error::UrdfSyntax { why };
+    let limited = |what: &str, n: usize, max: usize| match n > max {
+        true => Err(syntax(format!("it has {n} {what}, at most {max} are read"))),
+        false => Ok(()),
+    };
+    limited("bytes", xml.len(), MAX_BYTES)?;
+    limited("namespaces", xml.matches("xmlns").count(), MAX_NAMESPACES)?;
+    let n_attributes = |element: &str| element.bytes().filter(|byte| *byte == b'=').count();
+    limited("attributes in one element", xml.split('<').map(n_attributes).max().unwrap_or(0), MAX_ATTRIBUTES)?;
+    let options = ParsingOptions { nodes_limit: MAX_NODES, ..ParsingOptions::default() };
+    let document = Document::parse_with_options(xml, options).map_err(|error| syntax(error.to_string()))?;
+    match document.root_element().tag_name().name() {
+        "robot" => Ok(document),
+        other => Err(syntax(format!("it describes a <{other}>, expected a <robot>"))),
+    }
+}
+
+/// The reason why an element cannot be used.
+#[derive(Debug)]
+pub(crate) struct Problem {
+    pub(crate) line: u32,
+    pub(crate) why: String,
+}
+
+/// What was left out, in the order in which it was found.
+#[derive(Debug, Default)]
+pub(crate) struct Notes {
+    texts: Vec<String>,
+    n_omitted: usize,
+    /// First line and number of the unknown elements and attributes with one name in elements with one name.
+    unknown: BTreeMap<(String, String), (u32, usize)>,
+}
+
+impl Notes {
+    pub(crate) fn add(&mut self, line: u32, text: &str) {
+        match self.texts.len() < MAX_NOTES {
+            true => self.texts.push(format!("line {line}: {text}")),
+            false => self.n_omitted += 1,
+        }
+    }
+
+    pub(crate) fn into_texts(self) -> Vec<String> {
+        let Self { mut texts, n_omitted, unknown } = self;
+        if n_omitted > 0 {
+            texts.push(format!("{n_omitted} more such elements"));
+        }
+        let n_kinds = unknown.len();
+        for ((parent, what), (line, n)) in unknown.into_iter().take(MAX_NOTES) {
+            let others = if n > 1 { format!(" and {} more times", n - 1) } else { String::new() };
+            texts.push(format!("line {line}{others}: {what} in <{parent}> is not used"));
+        }
+        if n_kinds > MAX_NOTES {
+            texts.push(format!("{} more unknown names are not used", n_kinds - MAX_NOTES));
+        }
+        texts
+    }
+}
+
+/// An element with its attributes and children.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Element<'a>(Node<'a, 'a>);
+
+impl<'a> Element<'a> {
+    pub(super) fn root(document: &'a Document<'a>) -> Self {
+        Self(document.root_element())
+    }
+
+    /// Line in the file, from 1.
+    pub(crate) fn line(self) -> u32 {
+        self.0.document().text_pos_at(self.0.range().start).row
+    }
+
+    pub(crate) fn tag(self) -> &'a str {
+        self.0.tag_name().name()
+    }
+
+    pub(crate) fn problem(self, why: impl Into<String>) -> Problem {
+        Problem { line: self.line(), why: why.into() }
+    }
+
+    /// The children with this tag.
+    pub(crate) fn all(self, tag: &'static str) -> impl Iterator<Item = Element<'a>> {
+        self.children().filter(move |child| child.tag() == tag)
+    }
+
+    pub(crate) fn children(self) -> impl Iterator<Item = Element<'a>> {
+        let namespace = self.0.document().root_element().tag_name().namespace();
+        // An element of another namespace, such as that of xacro, means something else.
+        self.0.children().filter(move |node| node.is_element() && node.tag_name().namespace() == namespace).map(Self)
+    }
+
+    /// The only child with this tag. Repetitions are accepted if they have the same attributes.
+    pub(crate) fn only(self, tag: &'static str) -> Result<Option<Element<'a>>, Problem> {
+        let mut all = self.all(tag);
+        let Some(first) = all.next() else { return Ok(None) };
+        let attributes = |element: Element<'a>| element.0.attributes().map(|a| (a.name(), a.value()));
+        match all.find(|other| !attributes(first).eq(attributes(*other))) {
+            None => Ok(Some(first)),
+            Some(other) => {
+                let why =
+                    format!("it has two different elements <{tag}>, in lines {} and {}", first.line(), other.line());
+                Err(self.problem(why))
+            }
+        }
+    }
+
+    pub(crate) fn attribute(self, name: &str) -> Option<&'a str> {
+        self.0.attribute(name)
+    }
+
+    pub(crate) fn required(self, name: &str) -> Result<&'a str, Problem> {
+        self.attribute(name).ok_or_else(|| self.problem(format!("<{}> has no attribute {name:?}", self.tag())))
+    }
+
+    /// The numbers in an attribute.
+    pub(crate) fn numbers<const N: usize>(self, name: &str) -> Result<Option<[f64; N]>, Problem> {
+        let Some(text) = self.attribute(name) else { return Ok(None) };
+        let numbers: Option<Vec<f64>> = text.split_whitespace().map(|word| word.parse().ok()).collect();
+        let numbers = numbers.and_then(|numbers| <[f64; N]>::try_from(numbers).ok());
+        if let Some(numbers) = numbers.filter(|numbers| numbers.iter().all(|number| number.is_finite())) {
+            return Ok(Some(numbers));
+        }
+        let expected = match N {
+            1 => "a number".to_owned(),
+            _ => format!("{N} numbers with spaces between them"),
+        };
+        let xacro = if text.contains("${") { " (expand the file with xacro first)" } else { "" };
+        let shown: String = text.chars().take(60).collect();
+        Err(self.problem(format!("{name} of <{}> is {shown:?}, expected {expected}{xacro}", self.tag())))
+    }
+
+    pub(crate) fn number(self, name: &str) -> Result<Option<f64>, Problem> {
+        Ok(self.numbers::<1>(name)?.map(|[number]| number))
+    }
+
+    /// Notes each attribute and child that is not listed.
+    pub(crate) fn note_unknown(self, attributes: &[&str], children: &[&str], notes: &mut Notes) {
+        let mut add = |what: String, at: usize| {
+            let line = || self.0.document().text_pos_at(at).row;
+            let known = notes.unknown.entry((self.tag().to_owned(), what));
+            known.and_modify(|(_, n)| *n += 1).or_insert_with(|| (line(), 1));
+        };
+        for attribute in self.0.attributes() {
+            if attribute.namespace().is_none() && !attributes.contains(&attribute.name()) {
+                add(format!("the attribute {:?}", attribute.name()), attribute.range().start);
+            }
+        }
+        for child in self.0.children().filter(Node::is_element) {
+            let tag = child.tag_name();
+            if tag.namespace() == self.0.document().root_element().tag_name().namespace() {
+                if !children.contains(&tag.name()) {
+                    add(format!("<{}>", tag.name()), child.range().start);
+                }
+            } else if tag.namespace().is_some_and(|namespace| namespace.contains("xacro")) {
+                add(format!("<xacro:{}>, which xacro was to expand,", tag.name()), child.range().start);
+            }
+        }
+    }
+}

@@ -1,0 +1,524 @@
+//! Parses URDF text into a checked tree of links and joints.
+//!
+//! Source of the format: <https://wiki.ros.org/urdf/XML>, with `quat_xyzw` and `<capsule>` of later versions.
+
+pub(crate) mod element;
+pub(crate) mod joint;
+
+use crate::shape::{self, Shape};
+use crate::{Error, Transform};
+use element::{Element, Notes};
+use nalgebra::{Unit, Vector3};
+use std::collections::{HashMap, HashSet};
+
+/// Maximum size of a robot description.
+pub const MAX_BYTES: usize = 16 << 20;
+
+/// Links and joints of one robot. The links of every joint exist, no link has two parents, there is no cycle, and all
+/// numbers of valid joints are finite.
+#[derive(Clone, Debug)]
+pub struct Robot {
+    name: String,
+    links: Vec<String>,
+    joints: Vec<Joint>,
+    joints_by_name: HashMap<String, usize>,
+    /// Index of the joint above each link; `None` for a root.
+    joint_above: HashMap<String, Option<usize>>,
+    /// Visual and collision shapes of each link that has any.
+    shapes: HashMap<String, shape::LinkShapes>,
+    notes: Vec<String>,
+}
+
+/// One joint between two links.
+#[derive(Clone, Debug)]
+pub struct Joint {
+    /// Name in the URDF.
+    pub name: String,
+    /// Type of motion.
+    pub kind: JointKind,
+    /// Parent link.
+    pub parent: String,
+    /// Child link; its frame moves with the joint.
+    pub child: String,
+    /// Pose of the joint's frame in the parent link at joint value 0.
+    pub parent_from_joint: Transform,
+    /// Direction of motion in the joint's frame; unused for fixed joints.
+    pub axis: Unit<Vector3<f64>>,
+    /// Allowed range.
+    pub limits: JointLimits,
+    /// The joint that this joint follows; `None` if it moves independently.
+    pub mimic: Option<Mimic>,
+    /// Why the joint cannot be part of a chain. If there is an error, only the names above are valid.
+    pub problem: Option<Error>,
+}
+
+/// Type of a joint's motion.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum JointKind {
+    /// No motion.
+    Fixed,
+    /// Rotation about the axis, radians (revolute or continuous).
+    Revolute,
+    /// Translation along the axis, meters (prismatic).
+    Prismatic,
+    /// A type with more than one degree of freedom, with its name in the URDF, or "invalid".
+    Unsupported(&'static str),
+}
+
+/// Allowed range of a joint; infinite if the URDF sets no limit, or the limits are zero.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct JointLimits {
+    /// Smallest position, radians or meters.
+    pub lower: f64,
+    /// Largest position, radians or meters.
+    pub upper: f64,
+    /// Largest speed, radians or meters per second.
+    pub velocity: f64,
+    /// Largest torque or force, newton meters or newtons.
+    pub effort: f64,
+    /// False if the URDF states a range that is invalid. `lower` and `upper` are then infinite, and a program should not
+    /// move the joint.
+    pub is_range_valid: bool,
+}
+
+impl JointLimits {
+    /// No limits.
+    pub const NONE: Self = Self {
+        lower: f64::NEG_INFINITY,
+        upper: f64::INFINITY,
+        velocity: f64::INFINITY,
+        effort: f64::INFINITY,
+        is_range_valid: true,
+    };
+}
+
+/// Rule by which a mimic joint follows another: `multiplier * source + offset`.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Mimic {
+    /// Name of the followed joint.
+    pub source: String,
+    /// Factor on the source's value.
+    pub multiplier: f64,
+    /// Offset added to the scaled value, radians or meters.
+    pub offset: f64,
+}
+
+impl Robot {
+    /// Parses and checks URDF text. Elements that kinematics do not depend on are left out if they are invalid; see
+    /// [`Robot::notes`].
+    ///
+    /// # Errors
+    /// If it is not the XML of a robot, is larger than [`MAX_BYTES`], or its links and joints do not form a tree.
+    pub fn parse(xml: &str) -> Result<Self, Error> {
+        let document = element::parse(xml)?;
+        let root = Element::root(&document);
+        let mut notes = Notes::default();
+        root.note_unknown(
+            &["name", "version"],
+            &["link", "joint", "material", "gazebo", "transmission", "ros2_control"],
+            &mut notes,
+        );
+        let name = root.attribute("name").unwrap_or_default().to_owned();
+        let invalid =
+            |what, problem: element::Problem| Error::UrdfElement { line: problem.line, what, why: problem.why };
+        let name_of = |link: Element<'_>| -> Result<String, Error> {
+            Ok(link.required("name").map_err(|problem| invalid("a link".to_owned(), problem))?.to_owned())
+        };
+        let links = root.all("link").map(name_of).collect::<Result<Vec<_>, _>>()?;
+        if links.is_empty() {
+            return Err(Error::NoLinks { robot: name });
+        }
+        let joints = root.all("joint").map(|joint| joint::read(joint, &mut notes)).collect::<Result<Vec<_>, _>>()?;
+        indices_by_name("link", root.all("link"))?;
+        let joints_by_name = indices_by_name("joint", root.all("joint"))?;
+        let joint_above = joints_above(&links, &joints)?;
+        reject_cycles(&links, &joints, &joint_above)?;
+        let mut shapes = shape::read_all(root, &mut notes);
+        drop_below_problems(&links, &joints, &joint_above, &mut shapes);
+        Ok(Self { name, links, joints, joints_by_name, joint_above, shapes, notes: notes.into_texts() })
+    }
+
+    /// Name of the robot; empty if the file has none.
+    pub fn name(&self) -> &str {
+        &self.name
+    }
+
+    /// Names of all links, in file order.
+    pub fn links(&self) -> &[String] {
+        &self.links
+    }
+
+    /// All joints, in file order.
+    pub fn joints(&self) -> &[Joint] {
+        &self.joints
+    }
+
+    /// Visual shapes of a link, without invalid ones.
+    pub fn visuals(&self, link: &str) -> &[Shape] {
+        self.shapes.get(link).map_or(&[], |shapes| &shapes.visuals)
+    }
+
+    /// Collision shapes of a link, without invalid ones.
+    pub fn collisions(&self, link: &str) -> &[Shape] {
+        self.shapes.get(link).map_or(&[], |shapes| &shapes.collisions)
+    }
+
+    /// One sentence, with the line, for each element that was left out or is not used.
+    pub fn notes(&self) -> &[String] {
+        &self.notes
+    }
+
+    /// The joint with this name.
+    pub fn joint(&self, name: &str) -> Option<&Joint> {
+        self.joints_by_name.get(name).map(|ix| &self.joints[*ix])
+    }
+
+    /// The root link: the ancestor of all other links.
+    pub fn root(&self) -> Result<&str, Error> {
+        let roots: Vec<&String> = self.links.iter().filter(|link| self.joint_above[*link].is_none()).collect();
+        match roots[..] {
+            [root] => Ok(root),
+            _ => Err(Error::ManyRoots { roots: roots.into_iter().cloned().collect() }),
+        }
+    }
+
+    /// The joints from `base_link` down to `tip_link`, in that order.
+    pub fn path(&self, base_link: &str, tip_link: &str) -> Result<Vec<&Joint>, Error> {
+        self.check_link(base_link)?;
+        self.check_link(tip_link)?;
+        let mut joints_upwards = Vec::new();
+        let mut link = tip_link;
+        while link != base_link {
+            let Some(above) = self.joint_above[link] else {
+                let ancestors = joints_upwards.iter().map(|joint: &&Joint| joint.parent.clone()).collect();
+                return Err(Error::NotBelow { tip: tip_link.into(), base: base_link.into(), ancestors });
+            };
+            joints_upwards.push(&self.joints[above]);
+            link = &self.joints[above].parent;
+        }
+        joints_upwards.reverse();
+        Ok(joints_upwards)
+    }
+
+    fn check_link(&self, link: &str) -> Result<(), Error> {
+        if self.joint_above.contains_key(link) {
+            return Ok(());
+        }
+        Err(Error::UnknownLink { link: link.into(), robot: self.name.clone(), links: self.links.clone() })
+    }
+}
+
+/// Index of each element with a name, in file order.
+fn indices_by_name<'a>(
+    kind: &'static str,
+    elements: impl Iterator<Item = Element<'a>>,
+) -> Result<HashMap<String, usize>, Error> {
+    let mut indices = HashMap::new();
+    let mut lines = Vec::new();
+    for (ix, element) in elements.enumerate() {
+        lines.push(element);
+        let name = element.attribute("name").unwrap_or_default();
+        if let Some(first_ix) = indices.insert(name.to_owned(), ix) {
+            let lines = [lines[first_ix].line(), element.line()];
+            return Err(Error::Duplicate { kind, name: name.to_owned(), lines });
+        }
+    }
+    Ok(indices)
+}
+
+fn joints_above(links: &[String], joints: &[Joint]) -> Result<HashMap<String, Option<usize>>, Error> {
+    let mut above: HashMap<String, Option<usize>> = links.iter().map(|link| (link.clone(), None)).collect();
+    for (joint_ix, joint) in joints.iter().enumerate() {
+        if let Some(link) = [&joint.parent, &joint.child].into_iter().find(|link| !above.contains_key(*link)) {
+            return Err(Error::UndefinedLink { joint: joint.name.clone(), link: link.clone() });
+        }
+        if let Some(first_ix) = above.insert(joint.child.clone(), Some(joint_ix)).flatten() {
+            return Err(Error::TwoParents {
+                link: joint.child.clone(),
+                first: joints[first_ix].name.clone(),
+                second: joint.name.clone(),
+            });
+        }
+    }
+    Ok(above)
+}
+
+fn reject_cycles(links: &[String], joints: &[Joint], above: &HashMap<String, Option<usize>>) -> Result<(), Error> {
+    // Links from which a root was reached.
+    let mut sound: HashSet<&str> = HashSet::new();
+    for start in links {
+        let mut walked: HashSet<&str> = HashSet::new();
+        let mut link: &str = start;
+        while !sound.contains(link) {
+            if !walked.insert(link) {
+                return Err(Error::Cycle { link: link.to_owned() });
+            }
+            match above[link] {
+                Some(joint_ix) => link = &joints[joint_ix].parent,
+                None => break,
+            }
+        }
+        sound.extend(walked);
+    }
+    Ok(())
+}
+
+/// Removes the shapes whose pose is unknown, because a joint above them is invalid.
+fn drop_below_problems(
+    links: &[String],
+    joints: &[Joint],
+    above: &HashMap<String, Option<usize>>,
+    shapes: &mut HashMap<String, shape::LinkShapes>,
+) {
+    if joints.iter().all(|joint| joint.problem.is_none()) {
+        return;
+    }
+    let mut below: HashMap<&str, Vec<&str>> = HashMap::new();
+    for joint in joints {
+        below.entry(&joint.parent).or_default().push(&joint.child);
+    }
+    let is_placed = |link: &str| above[link].is_none_or(|joint_ix| joints[joint_ix].problem.is_none());
+    let mut dropped: Vec<&str> = links.iter().map(String::as_str).filter(|link| !is_placed(link)).collect();
+    let mut seen: HashSet<&str> = dropped.iter().copied().collect();
+    while let Some(link) = dropped.pop() {
+        shapes.remove(link);
+        dropped.extend(below.get(link).into_iter().flatten().copied().filter(|child| seen.insert(child)));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn robot(body: &str) -> Result<Robot, Error> {
+        Robot::parse(&format!(r#"<robot name="r"><link name="a"/><link name="b"/><link name="c"/>{body}</robot>"#))
+    }
+
+    fn joint_xml(name: &str, kind: &str, parent: &str, child: &str, rest: &str) -> String {
+        format!(r#"<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>{rest}</joint>"#)
+    }
+
+    fn error_message(result: Result<Robot, Error>) -> String {
+        let message = result.expect_err("this URDF must be rejected").to_string();
+        assert!(!message.contains('\n'), "more than one line: {message}");
+        message
+    }
+
+    #[test]
+    fn files_without_links_or_xml_are_rejected() {
+        let empty = error_message(Robot::parse(r#"<robot xmlns:xacro="http://wiki.ros.org/xacro"></robot>"#));
+        assert_eq!(empty, r#"urdf: robot "" has no <link> (an export that failed or was never expanded from xacro?)"#);
+        assert!(error_message(Robot::parse("")).starts_with("urdf: cannot be read"));
+        assert!(error_message(Robot::parse("{}")).starts_with("urdf: cannot be read"));
+        assert!(error_message(Robot::parse(r#"<robot name="r"><link name="a">"#)).starts_with("urdf: cannot be read"));
+    }
+
+    #[test]
+    fn malformed_trees_are_rejected() {
+        let twice = joint_xml("j", "fixed", "a", "b", "");
+        assert_eq!(
+            error_message(robot(&(twice.clone() + &twice))),
+            r#"urdf: joint "j" is defined twice, in lines 1 and 1"#
+        );
+        assert_eq!(error_message(robot(r#"<link name="a"/>"#)), r#"urdf: link "a" is defined twice, in lines 1 and 1"#);
+        let two = twice.clone() + &joint_xml("k", "fixed", "c", "b", "");
+        assert_eq!(error_message(robot(&two)), r#"urdf: link "b" has two parents, through joints "j" and "k""#);
+        let cycle = joint_xml("j", "fixed", "b", "c", "") + &joint_xml("k", "fixed", "c", "b", "");
+        assert!(matches!(robot(&cycle), Err(Error::Cycle { .. })));
+        let self_loop = joint_xml("j", "fixed", "c", "c", "");
+        assert_eq!(error_message(robot(&self_loop)), r#"urdf: link "c" is its own ancestor (the joints form a cycle)"#);
+        let nowhere = joint_xml("j", "fixed", "a", "d", "");
+        assert_eq!(error_message(robot(&nowhere)), r#"urdf: joint "j" joins link "d", which is not defined"#);
+    }
+
+    #[test]
+    fn invalid_joint_ends_only_chains_with_it() {
+        let sound = joint_xml("k", "fixed", "a", "c", "");
+        for (kind, rest, reason) in [
+            (
+                "revolute",
+                r#"<origin xyz="0 nan 0"/>"#,
+                r#"xyz of <origin> is "0 nan 0", expected 3 numbers with spaces"#,
+            ),
+            ("revolute", r#"<origin rpy="0, 0, 1"/>"#, r#"rpy of <origin> is "0, 0, 1", expected 3 numbers"#),
+            (
+                "fixed",
+                r#"<origin xyz="0 0 ${h}"/>"#,
+                r#""0 0 ${h}", expected 3 numbers with spaces between them (expand"#,
+            ),
+            ("fixed", r#"<origin xyz="0 0"/>"#, r#"is "0 0", expected 3 numbers"#),
+            ("fixed", r#"<origin rpy="0 0 1" quat_xyzw="0 0 0 1"/>"#, "a rotation as rpy and one as quat_xyzw"),
+            (
+                "fixed",
+                r#"<origin xyz="1 0 0"/><origin xyz="2 0 0"/>"#,
+                "two different elements <origin>, in lines 2 and 2",
+            ),
+            ("revolute", r#"<axis xyz="0 0 0"/>"#, "its axis is zero"),
+            (
+                "revolute",
+                r#"<mimic joint="k" multiplier="inf"/>"#,
+                r#"multiplier of <mimic> is "inf", expected a number"#,
+            ),
+            ("revolute", r#"<mimic multiplier="1"/>"#, r#"<mimic> has no attribute "joint""#),
+            ("ball", "", r#"its type is "ball", which does not exist"#),
+        ] {
+            let robot = robot(&(sound.clone() + "\n" + &joint_xml("j", kind, "a", "b", rest))).unwrap();
+            let message = crate::Chain::new(&robot, "a", "b").unwrap_err().to_string();
+            assert!(message.starts_with(r#"urdf: line 2: joint "j": "#), "{message}");
+            assert!(message.contains(reason), "{rest}: {message}");
+            assert_eq!(robot.notes(), [message.strip_prefix("urdf: ").unwrap()]);
+            assert!(crate::Chain::new(&robot, "a", "c").is_ok());
+        }
+        for (missing, reason) in [
+            (r#"<joint type="fixed"/>"#, r#"urdf: line 1: a joint: <joint> has no attribute "name""#),
+            (
+                r#"<joint name="j" type="fixed"><parent link="a"/></joint>"#,
+                r#"urdf: line 1: joint "j": it has no <child>"#,
+            ),
+            (r#"<joint name="j"><parent/></joint>"#, r#"urdf: line 1: joint "j": <parent> has no attribute "link""#),
+            ("<link/>", r#"urdf: line 1: a link: <link> has no attribute "name""#),
+        ] {
+            assert_eq!(error_message(robot(missing)), reason);
+        }
+    }
+
+    #[test]
+    fn invalid_parts_without_effect_on_poses_are_noted() {
+        let visual = |shape: &str| format!(r#"<link name="d"><visual>{shape}</visual></link>"#);
+        let sphere = r#"<geometry><sphere radius="1"/></geometry>"#;
+        let inertial = |inside: &str| format!(r#"<link name="d"><inertial>{inside}</inertial></link>"#);
+        let limit = |text: &str| joint_xml("j", "revolute", "a", "b", &format!("<limit {text}/>"));
+        for (body, expected) in [
+            (limit(r#"lower="1" upper="-1""#), r#"joint "j": its range is 1 to -1"#),
+            (limit(r#"lower="nan" upper="1""#), r#"joint "j": lower of <limit> is "nan", expected a number"#),
+            (limit(r#"lower="-1" upper="1" safe="2""#), r#"the attribute "safe" in <limit> is not used"#),
+            (joint_xml("j", "revolute", "a", "b", r#"<orgin xyz="1 0 0"/>"#), "<orgin> in <joint> is not used"),
+            ("<xacro:arm/>".to_owned(), "<xacro:arm>, which xacro was to expand, in <robot> is not used"),
+            (
+                inertial(r#"<inertia ixx="1"/>"#),
+                r#"the inertia of link "d" is invalid (it is not used): it has no <mass>"#,
+            ),
+            (
+                inertial(r#"<mass value="1"/><inertia izz="0.48ea8d"/>"#),
+                r#"izz of <inertia> is "0.48ea8d", expected a number"#,
+            ),
+            (
+                visual(&format!(r#"{sphere}<material name="m"><texture/></material>"#)),
+                r#"a texture of link "d" is not drawn: """#,
+            ),
+        ] {
+            let robot = format!(
+                r#"<robot xmlns:xacro="http://wiki.ros.org/xacro"><link name="a"/><link name="b"/>{body}</robot>"#
+            );
+            let robot = Robot::parse(&robot).unwrap();
+            let [note] = robot.notes() else { panic!("{body}: {:?}", robot.notes()) };
+            assert!(note.starts_with("line 1: ") && note.ends_with(expected), "{note}");
+        }
+        let many = joint_xml("j", "fixed", "a", "b", "<x/><x/>\n<x/>");
+        assert_eq!(robot(&many).unwrap().notes(), ["line 1 and 2 more times: <x> in <joint> is not used"]);
+        let unnamed = visual(&format!(r#"{sphere}<material><color rgba="1 0 0 1"/></material>"#));
+        let unnamed = robot(&unnamed).unwrap();
+        assert_eq!((unnamed.notes().len(), unnamed.visuals("d")[0].color_srgba), (0, Some([1.0, 0.0, 0.0, 1.0])));
+    }
+
+    #[test]
+    fn shapes_below_an_invalid_joint_are_not_drawn() {
+        let shape = |link: &str| {
+            format!(r#"<link name="{link}"><visual><geometry><sphere radius="1"/></geometry></visual></link>"#)
+        };
+        let invalid = joint_xml("j", "fixed", "a", "d", r#"<origin xyz="x"/>"#);
+        let tree = shape("d") + &shape("e") + &shape("f") + &invalid + &joint_xml("k", "fixed", "d", "e", "");
+        let robot = robot(&(tree + &joint_xml("l", "fixed", "a", "f", ""))).unwrap();
+        assert_eq!(["d", "e", "f"].map(|link| robot.visuals(link).len()), [0, 0, 1]);
+    }
+
+    #[test]
+    fn large_descriptions_are_read_in_linear_time_or_refused() {
+        const N: usize = 20_000;
+        let link = |ix: usize| format!(r#"<link name="l{ix}"/>"#);
+        let joint = |ix: usize| {
+            let mimic = if ix > 1 { format!(r#"<mimic joint="j{}" multiplier="1"/>"#, ix - 1) } else { String::new() };
+            joint_xml(&format!("j{ix}"), "prismatic", &format!("l{}", ix - 1), &format!("l{ix}"), &mimic)
+        };
+        let chain = format!(
+            "<robot>{}{}</robot>",
+            (0..=N).map(link).collect::<String>(),
+            (1..=N).map(joint).collect::<String>()
+        );
+        // Quadratic time would be minutes, also on a fast computer.
+        let robot = Robot::parse(&chain).unwrap();
+        let chain = crate::Chain::new(&robot, robot.root().unwrap(), &format!("l{N}")).unwrap();
+        assert_eq!(chain.joint_names(), ["j1"]);
+        assert!((chain.forward(&[0.5]).unwrap().translation.x - 0.5 * N as f64).abs() < 1e-6);
+
+        let deep = format!("<robot>{}{}<link name=\"a\"/></robot>", "<a>".repeat(200_000), "</a>".repeat(200_000));
+        assert_eq!(Robot::parse(&deep).unwrap().links(), ["a"]);
+        let named: String = (0..3000).map(|ix| format!(" a{ix}=''")).collect();
+        let namespaces: String = (0..200).map(|ix| format!("<a xmlns:n{ix}='x'/>")).collect();
+        for (text, what) in [
+            (format!("<robot{named}/>"), "3000 attributes in one element, at most 2000"),
+            (format!("<robot>{namespaces}</robot>"), "200 namespaces, at most 100"),
+            (format!("<robot>{}</robot>", "<a/>".repeat(1 << 20)), "nodes limit reached"),
+            (" ".repeat(MAX_BYTES + 1), "16777217 bytes, at most 16777216"),
+            ("<sdf/>".to_owned(), "it describes a <sdf>, expected a <robot>"),
+        ] {
+            let message = error_message(Robot::parse(&text));
+            assert!(message.starts_with("urdf: cannot be read: ") && message.contains(what), "{message}");
+        }
+    }
+
+    #[test]
+    fn elements_may_be_in_any_order() {
+        let visual = r#"<visual><geometry><sphere radius="1"/></geometry></visual>"#;
+        let mixed =
+            format!(r#"<link name="d">{visual}<inertial><mass value="1"/><inertia/></inertial>{visual}</link>"#);
+        let robot = robot(&(joint_xml("j", "fixed", "a", "d", "") + &mixed)).unwrap();
+        assert_eq!((robot.visuals("d").len(), robot.notes().len()), (2, 0));
+    }
+
+    #[test]
+    fn quaternions_of_newer_versions_are_read() {
+        let pose =
+            |origin: &str| robot(&joint_xml("j", "fixed", "a", "b", origin)).unwrap().joints()[0].parent_from_joint;
+        let (rpy, quaternion) = (
+            r#"<origin xyz="1 2 3" rpy="0 0 1"/>"#,
+            r#"<origin xyz="1 2 3" quat_xyzw="0 0 0.479425538604203 0.8775825618903728"/>"#,
+        );
+        assert!((pose(rpy).to_homogeneous() - pose(quaternion).to_homogeneous()).abs().max() < 1e-15);
+    }
+
+    #[test]
+    fn root_and_path_are_found() {
+        let chain = joint_xml("j", "revolute", "b", "c", "") + &joint_xml("k", "fixed", "a", "b", "");
+        let found = robot(&chain).unwrap();
+        assert_eq!(found.root(), Ok("a"));
+        let names: Vec<&str> = found.path("a", "c").unwrap().iter().map(|joint| joint.name.as_str()).collect();
+        assert_eq!(names, ["k", "j"]);
+        assert!(found.path("b", "b").unwrap().is_empty());
+        assert_eq!(found.path("c", "b").unwrap_err().to_string(), r#"link "b" is not below link "c"; above it are a"#);
+        assert_eq!(
+            found.path("a", "hand").unwrap_err().to_string(),
+            r#"link "hand" is not in the URDF of "r"; its links are a, b, c"#
+        );
+        let roots = robot("").unwrap().root().unwrap_err().to_string();
+        assert_eq!(roots, "urdf: 3 links have no parent (a, b, c), so the base link has to be named");
+    }
+
+    #[test]
+    fn missing_limits_are_infinite() {
+        let limit = r#"<limit lower="-1" upper="2" velocity="3" effort="4"/>"#;
+        let read = |kind: &str, rest: &str| robot(&joint_xml("j", kind, "a", "b", rest)).unwrap().joints()[0].limits;
+        let given = JointLimits { lower: -1.0, upper: 2.0, velocity: 3.0, effort: 4.0, is_range_valid: true };
+        let (up, down) = (f64::INFINITY, f64::NEG_INFINITY);
+        assert_eq!(read("revolute", limit), given);
+        assert_eq!(read("continuous", limit), JointLimits { lower: down, upper: up, ..given });
+        assert_eq!(read("revolute", ""), JointLimits::NONE);
+        assert_eq!(read("revolute", r#"<limit lower="0" upper="0" velocity="0" effort="0"/>"#), JointLimits::NONE);
+        assert_eq!(
+            read("revolute", r#"<limit lower="-1" upper="2"/>"#),
+            JointLimits { velocity: up, effort: up, ..given }
+        );
+        let swapped = read("revolute", r#"<limit lower="2" upper="-1" velocity="3" effort="4"/>"#);
+        assert_eq!(swapped, JointLimits { lower: down, upper: up, is_range_valid: false, ..given });
+    }
+}
