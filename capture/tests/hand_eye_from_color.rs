@@ -1,7 +1,7 @@
 //! Estimates a hand-eye transform from the color images of a real arm. Skipped without the test data.
 
 use calibration::{Alignment, CameraRefinement, ParamSet, align, rigid_transform};
-use keyframe::{Holdout, Keyframe};
+use keyframe::Keyframe;
 use kinematics::Transform;
 use nalgebra::Vector3;
 use std::sync::Arc;

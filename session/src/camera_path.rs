@@ -3,9 +3,10 @@
 use crate::Error;
 use crate::error::Context;
 use keyframe::ensure;
-use kinematics::Transform;
-use nalgebra::{Matrix3, Matrix4, Rotation3, Translation3, UnitQuaternion};
+use kinematics::{Transform, transform};
 use serde::Deserialize;
+use serde_json::Value;
+use std::collections::BTreeMap;
 use std::path::Path;
 
 /// One viewpoint.
@@ -24,18 +25,41 @@ pub struct CameraPath {
     pub cameras: Vec<PathCamera>,
     /// Width and height of the pictures in pixels, if the path specifies them.
     pub size_px: Option<[u32; 2]>,
+    /// Whether the path was made for panoramas.
+    pub is_panoramic: bool,
+    /// Notes about parts of the file that are not used: one sentence each.
+    pub notes: Vec<String>,
 }
 
-/// The only camera type that is supported in a path.
 const PERSPECTIVE: &str = "perspective";
+const EQUIRECTANGULAR: &str = "equirectangular";
+/// Largest side of a picture.
+const MAX_SIDE_PX: f64 = 16384.0;
+/// Keys that do not change the pictures: how the path was edited, and how its video is played.
+const UNUSED: [&str; 9] = [
+    "default_transition_sec",
+    "fps",
+    "is_cycle",
+    "keyframes",
+    "seconds",
+    "smoothness_value",
+    // Keys of one camera.
+    "aspect",
+    "file_path",
+    "render_time",
+];
 
-/// The file format of nerfstudio.
+/// The file format of nerfstudio. Sizes are whole numbers, but the viewer writes them with decimals.
 #[derive(Debug, Deserialize)]
 struct PathFile {
-    render_height: Option<u32>,
-    render_width: Option<u32>,
+    render_height: Option<f64>,
+    render_width: Option<f64>,
     camera_type: Option<String>,
+    /// Vertical field of view of cameras without their own, degrees.
+    default_fov: Option<f64>,
     camera_path: Vec<PathFileCamera>,
+    #[serde(flatten)]
+    other: BTreeMap<String, Value>,
 }
 
 #[derive(Debug, Deserialize)]
@@ -44,6 +68,34 @@ struct PathFileCamera {
     camera_to_world: Vec<f64>,
     /// Vertical field of view, degrees.
     fov: Option<f64>,
+    #[serde(flatten)]
+    other: BTreeMap<String, Value>,
+}
+
+impl PathFile {
+    fn size_px(&self) -> crate::Result<Option<[u32; 2]>> {
+        let side = |name: &str, side_px: Option<f64>| {
+            let Some(side_px) = side_px else { return Ok(None) };
+            ensure!(
+                side_px.fract() == 0.0 && (1.0..=MAX_SIDE_PX).contains(&side_px),
+                "{name} is {side_px}, must be a whole number from 1 to {MAX_SIDE_PX}"
+            );
+            #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "checked above")]
+            Ok::<_, crate::Error>(Some(side_px as u32))
+        };
+        let (width, height) = (side("render_width", self.render_width)?, side("render_height", self.render_height)?);
+        Ok(width.zip(height).map(|(width, height)| [width, height]))
+    }
+
+    fn notes(&self) -> Vec<String> {
+        let of_cameras = self.camera_path.iter().flat_map(|camera| camera.other.keys());
+        let mut unknown: Vec<&str> =
+            self.other.keys().chain(of_cameras).map(String::as_str).filter(|key| !UNUSED.contains(key)).collect();
+        unknown.sort_unstable();
+        unknown.dedup();
+        let advice = |key: &str| if key == "crop" { "; use --crop" } else { "" };
+        unknown.iter().map(|key| format!("{key:?} is not used{}", advice(key))).collect()
+    }
 }
 
 impl CameraPath {
@@ -57,7 +109,8 @@ impl CameraPath {
     /// [`kinematics::camera`].
     pub fn of_pose(numbers: &[f64]) -> Result<Self, Error> {
         let world_from_camera = rigid(numbers).map_err(|error| Error::BadInput(format!("--pose: {error}")))?;
-        Ok(Self { cameras: vec![PathCamera { world_from_camera, fov_y_rad: None }], size_px: None })
+        let cameras = vec![PathCamera { world_from_camera, fov_y_rad: None }];
+        Ok(Self { cameras, size_px: None, is_panoramic: false, notes: Vec::new() })
     }
 
     fn parse(text: &str) -> crate::Result<Self> {
@@ -65,40 +118,32 @@ impl CameraPath {
         ensure!(!file.camera_path.is_empty(), "it contains no cameras");
         let camera_type = file.camera_type.as_deref().unwrap_or(PERSPECTIVE);
         ensure!(
-            camera_type == PERSPECTIVE,
-            "camera_type is {camera_type:?}, but only {PERSPECTIVE:?} is supported (for panoramas, use --equirect)"
+            [PERSPECTIVE, EQUIRECTANGULAR].contains(&camera_type),
+            "camera_type is {camera_type:?}, but only {PERSPECTIVE:?} and {EQUIRECTANGULAR:?} are supported"
         );
         let camera = |(ix, camera): (usize, &PathFileCamera)| {
             let world_from_opengl = rigid(&camera.camera_to_world).with_context(|| format!("camera {ix}"))?;
             let opengl_from_camera = drivers::dataset::nerfstudio::opengl_from_camera();
             Ok::<_, crate::Error>(PathCamera {
                 world_from_camera: world_from_opengl * opengl_from_camera,
-                fov_y_rad: camera.fov.map(f64::to_radians),
+                fov_y_rad: camera.fov.or(file.default_fov).map(f64::to_radians),
             })
         };
         Ok(Self {
             cameras: file.camera_path.iter().enumerate().map(camera).collect::<Result<_, _>>()?,
-            size_px: file.render_width.zip(file.render_height).map(|(width, height)| [width, height]),
+            size_px: file.size_px()?,
+            is_panoramic: camera_type == EQUIRECTANGULAR,
+            notes: file.notes(),
         })
     }
 }
 
-/// Converts a row-major 4x4 matrix to a rigid transform.
+/// Converts a row-major 4x4 matrix, whose numbers may be rounded, to a rigid transform.
 pub fn rigid(numbers: &[f64]) -> crate::Result<Transform> {
-    /// Numbers in files are often rounded to about six digits.
-    const TOLERANCE: f64 = 1e-3;
-    ensure!(numbers.len() == 16, "a pose has 16 numbers, got {}", numbers.len());
-    ensure!(numbers.iter().all(|number| number.is_finite()), "the pose has a non-finite number");
-    let matrix = Matrix4::from_row_slice(numbers);
-    let rotation: Matrix3<f64> = matrix.fixed_view::<3, 3>(0, 0).into();
-    let deviation = (rotation * rotation.transpose() - Matrix3::identity()).amax();
-    ensure!(deviation < TOLERANCE && rotation.determinant() > 0.0, "the upper left 3x3 block is not a rotation");
-    ensure!(
-        (matrix.row(3) - nalgebra::RowVector4::new(0.0, 0.0, 0.0, 1.0)).amax() < TOLERANCE,
-        "the last row is not 0 0 0 1"
-    );
-    let rotation = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix(&rotation));
-    Ok(Transform::from_parts(Translation3::new(matrix[(0, 3)], matrix[(1, 3)], matrix[(2, 3)]), rotation))
+    let rows: &[f64; 16] =
+        numbers.try_into().ok().with_context(|| format!("a pose has 16 numbers, got {}", numbers.len()))?;
+    let (pose, _) = transform::from_rounded_rows(rows).map_err(|error| Error::BadInput(error.to_string()))?;
+    Ok(pose)
 }
 
 #[cfg(test)]
@@ -115,7 +160,7 @@ mod tests {
             "camera_path": [{ "camera_to_world": [1, 0, 0, 1, 0, 1, 0, 2, 0, 0, 1, 3, 0, 0, 0, 1], "fov": 90.0, "aspect": 1.33 }],
         });
         let path = CameraPath::parse(&text.to_string()).expect("a path");
-        assert_eq!(path.size_px, Some([640, 480]));
+        assert_eq!((path.size_px, &path.notes[..]), (Some([640, 480]), &[][..]));
         let camera = path.cameras[0];
         assert_eq!(camera.fov_y_rad, Some(std::f64::consts::FRAC_PI_2));
         let ahead_in_world = camera.world_from_camera * Point3::new(0.0, 0.0, 1.0);
@@ -131,8 +176,44 @@ mod tests {
                 serde_json::json!({ "camera_type": camera_type, "camera_path": [{ "camera_to_world": IDENTITY }] });
             CameraPath::parse(&text.to_string())
         };
-        assert!(of_type("perspective").is_ok());
+        assert!(!of_type("perspective").expect("a perspective").is_panoramic);
+        assert!(of_type("equirectangular").expect("a panorama").is_panoramic);
         assert!(of_type("fisheye").expect_err("a fisheye").to_string().contains("fisheye"));
+    }
+
+    /// The keys in docs/reference/cli.md.
+    #[test]
+    fn keys_are_used_or_named() {
+        let camera = serde_json::json!({ "camera_to_world": IDENTITY });
+        let plain = serde_json::json!({ "render_width": 8, "render_height": 6, "camera_path": [camera] });
+        let parse = |file: &Value| CameraPath::parse(&file.to_string());
+        let mut viewer = plain.clone();
+        (viewer["render_width"], viewer["render_height"]) = (8.0.into(), 6.0.into());
+        for key in &UNUSED[..6] {
+            viewer[*key] = 1.into();
+        }
+        for key in &UNUSED[6..] {
+            viewer["camera_path"][0][*key] = 1.into();
+        }
+        assert_eq!(parse(&viewer).expect("as the viewer writes it"), parse(&plain).expect("a path"));
+        for (key, note) in [("crop", "\"crop\" is not used; use --crop"), ("smooth", "\"smooth\" is not used")] {
+            let mut changed = plain.clone();
+            changed[key] = 1.into();
+            assert_eq!(parse(&changed).expect("a path").notes, [note]);
+            let mut changed = plain.clone();
+            changed["camera_path"][0][key] = 1.into();
+            assert_eq!(parse(&changed).expect("a path").notes, [note]);
+        }
+        let mut wide = plain.clone();
+        wide["default_fov"] = 90.into();
+        assert_eq!(parse(&wide).expect("a path").cameras[0].fov_y_rad, Some(std::f64::consts::FRAC_PI_2));
+        for size in ["0", "7.5", "-8", "1e9", "null"] {
+            let text = plain.to_string().replace("\"render_width\":8", &format!("\"render_width\":{size}"));
+            match CameraPath::parse(&text) {
+                Err(error) => assert!(error.to_string().contains("render_width is"), "{error}"),
+                Ok(path) => assert!(size == "null" && path.size_px.is_none()),
+            }
+        }
     }
 
     #[test]
@@ -145,7 +226,7 @@ mod tests {
         let mut unknown = IDENTITY;
         unknown[3] = f64::NAN;
         for (numbers, word) in
-            [(&IDENTITY[..15], "16 numbers"), (&stretched, "rotation"), (&mirrored, "rotation"), (&unknown, "finite")]
+            [(&IDENTITY[..15], "16 numbers"), (&stretched, "not rigid"), (&mirrored, "not rigid"), (&unknown, "finite")]
         {
             let error = CameraPath::of_pose(numbers).expect_err(word).to_string();
             assert!(error.contains(word), "{error}");

@@ -105,6 +105,12 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         (None, Some(pose)) => CameraPath::of_pose(&pose.0)?,
         (None, None) => return Err(BadArgument("either --camera-path or --pose is needed".into()).into()),
     };
+    for note in &path.notes {
+        log::warn!("--camera-path: {note}");
+    }
+    if path.is_panoramic && !args.equirect {
+        return Err(BadArgument("--camera-path: the path was made for panoramas; add --equirect".into()).into());
+    }
     let size_px = args.size.or(path.size_px).unwrap_or(DEFAULT_SIZE_PX);
     let requests = path.cameras.iter().map(|camera| args.request(camera, size_px)).collect::<Result<Vec<_>, _>>()?;
     expect_model(&args.model)?;

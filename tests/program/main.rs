@@ -7,6 +7,7 @@ mod calibrate_eye_to_hand;
 mod calibrate_mistakes;
 mod calibrate_page;
 mod calibrate_scan;
+mod cases;
 mod cli;
 mod command;
 mod depth_from;

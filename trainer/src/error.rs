@@ -223,7 +223,7 @@ pub enum Error {
         path: PathBuf,
     },
     /// Splats cannot be read.
-    #[error("no splats in {}{hint}", path.display())]
+    #[error("cannot read splats from {}{hint}", path.display())]
     NoSplats {
         /// Folder or file.
         path: PathBuf,

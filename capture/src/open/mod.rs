@@ -196,7 +196,11 @@ pub fn chain_of(rig: &Rig) -> crate::Result<Chain> {
 
 fn stored_rig(path: &Path, recording: &Recording, overrides: &[Override]) -> crate::Result<Rig> {
     let text = |name| {
-        let bytes = recording.attachment(name).with_context(|| format!("the recording {path:?} contains no {name}"))?;
+        let bytes = recording.attachment(name).with_context(|| {
+            format!(
+                "the recording {path:?} contains no {name}; if another program removed it, name the rig file with --rig"
+            )
+        })?;
         std::str::from_utf8(bytes).with_context(|| format!("the recording {path:?}: {name} is not text"))
     };
     Ok(Rig::parse(RIG_FILE, text(RIG_FILE)?, text(URDF_FILE)?, overrides)?)

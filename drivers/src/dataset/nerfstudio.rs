@@ -5,6 +5,7 @@
 use super::posed_image::image_size_px;
 use super::{Dataset, DatasetImage, DepthFile, ListedSplit, MAX_POSITION_M, SkippedImages, first_names, plural};
 use crate::Error;
+use crate::wire::json;
 use kinematics::{Intrinsics, Lens, Stamp, Transform, transform};
 use nalgebra::{UnitQuaternion, Vector3};
 use serde::de::Error as _;
@@ -60,7 +61,7 @@ pub fn read(path: &Path) -> Result<Dataset, Error> {
         return Err(file_error("not a recording (.mcap), a dataset folder or a transforms.json".to_owned()));
     }
     let mut document: Document =
-        serde_json::from_str(&nan_as_null(&text)).map_err(|error| file_error(error.to_string()))?;
+        serde_json::from_str(&json::nan_as_null(&text)).map_err(|error| file_error(error.to_string()))?;
     document.frames.sort_by(|a, b| a.file_path.cmp(&b.file_path));
     let splits = document.splits().map_err(file_error)?;
     let meters_per_count = document.depth_unit_scale_factor.unwrap_or(DEFAULT_METERS_PER_COUNT);
@@ -465,23 +466,4 @@ fn find_image(folder: &Path, name: &str) -> Option<PathBuf> {
 /// Text of the source of an error, or of the error if it has no source.
 fn reason_of(error: &Error) -> String {
     std::error::Error::source(error).map_or_else(|| error.to_string(), ToString::to_string)
-}
-
-/// Replaces `NaN` and `Infinity` outside of strings with null. Python writes them although JSON does not have them;
-/// with null, the error can name the frame.
-fn nan_as_null(text: &str) -> String {
-    let mut out = String::with_capacity(text.len());
-    for (ix, part) in text.split('"').enumerate() {
-        if ix > 0 {
-            out.push('"');
-        }
-        // An escaped quote in a name changes which parts count as strings. Names do not contain these words, so this
-        // has no effect.
-        if ix % 2 == 0 && (part.contains("NaN") || part.contains("Infinity")) {
-            out.push_str(&part.replace("-Infinity", "null").replace("Infinity", "null").replace("NaN", "null"));
-        } else {
-            out.push_str(part);
-        }
-    }
-    out
 }

@@ -2,8 +2,9 @@
 //!
 //! The file is read sequentially without its index, so a truncated recording yields every sample before the cut.
 
+use super::RIG_FILE;
 use super::record::Record;
-use super::records::{RawRecord, ReadError, Records};
+use super::records::{self, RawRecord, ReadError, Records};
 use super::topic::{JOINT_NAMES, Topic};
 use crate::wire::{Malformed, foxglove, joint_state, point_cloud};
 use crate::{BasePose, Error, Image, Sample, Source, TruthImage};
@@ -67,6 +68,9 @@ impl Recording {
             ended: false,
         };
         recording.first = recording.read_sample()?;
+        if recording.attachment(RIG_FILE).is_none() {
+            recording.find_attachments().map_err(open)?;
+        }
         if recording.first.is_none() {
             return Err(Error::EmptyRecording { path: path.to_owned() });
         }
@@ -87,6 +91,18 @@ impl Recording {
     /// Describes the damage of the file and how much could be read. Available after the last sample.
     pub fn damage(&self) -> Option<&str> {
         self.damage.as_deref()
+    }
+
+    /// Finds attachments behind the first sample. `mcap filter`, `merge` and others write them at the end of the file.
+    fn find_attachments(&mut self) -> std::io::Result<()> {
+        let mut file = BufReader::new(files::open(&self.path)?);
+        file.seek_relative(i64::try_from(mcap::MAGIC.len()).unwrap_or_default())?;
+        for RawRecord { opcode, bytes } in records::attachments(file) {
+            if let Ok(Record::Attachment { name, data }) = Record::decode(opcode, &bytes) {
+                self.attachments.insert(name.to_owned(), data.to_vec());
+            }
+        }
+        Ok(())
     }
 
     fn read_sample(&mut self) -> Result<Option<Sample>, Error> {

@@ -2,12 +2,12 @@
 //!
 //! Source: the MCAP format specification, <https://mcap.dev/spec>, "Records".
 
+use super::records::ATTACHMENT;
 use std::collections::BTreeMap;
 
 const SCHEMA: u8 = 0x03;
 const CHANNEL: u8 = 0x04;
 const MESSAGE: u8 = 0x05;
-const ATTACHMENT: u8 = 0x09;
 
 /// A decoded record.
 #[derive(Debug, PartialEq, Eq)]

@@ -7,7 +7,7 @@
 use crc32fast::Hasher;
 use lz4_flex::frame::FrameDecoder;
 use ruzstd::decoding::StreamingDecoder;
-use std::io::{Cursor, Read};
+use std::io::{Cursor, Read, Seek, SeekFrom};
 
 /// Maximum length of a record. Longer records are treated as damage; the largest valid record contains one image.
 const MAX_RECORD_BYTES: u64 = 512 << 20;
@@ -20,6 +20,7 @@ const HEAD_BYTES: usize = 1 + 8;
 const CHUNK_HEAD_BYTES: usize = 8 + 8 + 8 + 4 + 4;
 
 const FOOTER: u8 = 0x02;
+pub(super) const ATTACHMENT: u8 = 0x09;
 const CHUNK: u8 = 0x06;
 
 /// The reason why reading ends before the end of a file.
@@ -142,6 +143,25 @@ impl<R: Read> Records<R> {
         let n_skipped = std::io::copy(&mut self.input.by_ref().take(n_bytes), &mut std::io::sink())?;
         if n_skipped == n_bytes { Ok(()) } else { Err(ReadError::Truncated) }
     }
+}
+
+/// Reads the attachments of a file after its leading magic bytes, and skips everything else. Damage ends the search.
+pub(super) fn attachments(mut input: impl Read + Seek) -> Vec<RawRecord> {
+    let mut attachments = Vec::new();
+    while let Ok((opcode, n_bytes, _)) = head_of(&mut input) {
+        match opcode {
+            FOOTER => break,
+            ATTACHMENT => match bytes_of(&mut input, n_bytes) {
+                Ok(bytes) => attachments.push(RawRecord { opcode, bytes }),
+                Err(_) => break,
+            },
+            _ => match i64::try_from(n_bytes).map(|n_bytes| input.seek(SeekFrom::Current(n_bytes))) {
+                Ok(Ok(_)) => {}
+                _ => break,
+            },
+        }
+    }
+    attachments
 }
 
 /// Reads opcode and length of a record. Returns them with their bytes.

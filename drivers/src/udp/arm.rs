@@ -39,8 +39,7 @@ impl Arm for UdpArm {
 
     fn read(&mut self, timeout: Duration) -> Result<JointState, Error> {
         let Self { names, states } = self;
-        let read =
-            states.next(timeout, |bytes| decode_joints(bytes, names).map(|reported| (reported.header, reported)))?;
+        let read = states.next(timeout, |bytes| decode_joints(bytes, names))?;
         let (stamp, reported) = read.ok_or(Error::NoJoints { waited: timeout })?;
         Ok(JointState { stamp, position: reported.position, velocity: reported.velocity, effort: reported.effort })
     }

@@ -37,7 +37,7 @@ impl UdpBase {
 impl Base for UdpBase {
     fn next_pose(&mut self, timeout: Duration) -> Result<BasePose, Error> {
         let until = Instant::now() + timeout;
-        let decode = |bytes: &[u8]| decode_pose(bytes).map(|pose| (pose.header, pose));
+        let decode = |bytes: &[u8]| decode_pose(bytes).map(|pose| (pose.header, Some(pose)));
         loop {
             let remaining = until.saturating_duration_since(Instant::now());
             let (stamp, pose) = self.poses.next(remaining, decode)?.ok_or(Error::NoBasePose { waited: timeout })?;

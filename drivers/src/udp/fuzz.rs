@@ -67,8 +67,7 @@ pub(crate) fn joint_states(bytes: &[u8]) -> Vec<Vec<f64>> {
             at += Duration::from_millis(millis.unwrap_or(1).into());
             let datagram =
                 ReceivedDatagram { at, from: ([127, 0, 0, 1], 7).into(), bytes: line.to_vec(), n_dropped: 0 };
-            let read =
-                arm.take(&datagram, |bytes| decode_joints(bytes, names).map(|reported| (reported.header, reported)));
+            let read = arm.take(&datagram, |bytes| decode_joints(bytes, names));
             if let Some((stamp, state)) = read {
                 assert_monotonic(&mut newest[0], stamp, at);
                 assert_eq!(state.position.len(), names.len());
@@ -77,7 +76,7 @@ pub(crate) fn joint_states(bytes: &[u8]) -> Vec<Vec<f64>> {
                 reported.push(state.position);
             }
             let decode = |bytes: &[u8]| {
-                decode_pose(bytes).map(|PoseDatagram { header, world_from_base, .. }| (header, world_from_base))
+                decode_pose(bytes).map(|PoseDatagram { header, world_from_base, .. }| (header, Some(world_from_base)))
             };
             if let Some((stamp, pose)) = base.take(&datagram, decode) {
                 assert_monotonic(&mut newest[1], stamp, at);

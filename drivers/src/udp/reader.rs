@@ -39,11 +39,12 @@ impl DatagramReader {
         self.counts
     }
 
-    /// Returns the next value that `decode` accepts with its stamp on our clock, or `None` if none came in time.
+    /// Returns the next value that `decode` accepts with its stamp on our clock, or `None` if none came in time. A datagram
+    /// without a value, which is for another device, only counts in the sequence.
     pub(super) fn next<T>(
         &mut self,
         timeout: Duration,
-        decode: impl Fn(&[u8]) -> Result<(DatagramHeader, T), Malformed>,
+        decode: impl Fn(&[u8]) -> Result<(DatagramHeader, Option<T>), Malformed>,
     ) -> Result<Option<(Stamp, T)>, Error> {
         let until = Instant::now() + timeout;
         while let Some(datagram) = self.receiver.next(until)? {
@@ -60,7 +61,7 @@ impl DatagramReader {
     pub(super) fn take<T>(
         &mut self,
         datagram: &ReceivedDatagram,
-        decode: impl Fn(&[u8]) -> Result<(DatagramHeader, T), Malformed>,
+        decode: impl Fn(&[u8]) -> Result<(DatagramHeader, Option<T>), Malformed>,
     ) -> Option<(Stamp, T)> {
         let Self { plural, receiver, sequence, counts, senders } = self;
         let device = receiver.device();
@@ -93,6 +94,11 @@ impl DatagramReader {
                 return None;
             }
         }
+        let Some(reading) = reading else {
+            let what = format_args!("ignored a datagram for another device");
+            count_and_warn(device, &mut counts.n_other, 1, what);
+            return None;
+        };
         let n_before = sequence.n_clock_restarts();
         let stamp = sequence.stamp(&header, datagram.at);
         count_and_warn(device, &mut counts.n_clock_restarts, sequence.n_clock_restarts() - n_before, CLOCK_RESTARTED);

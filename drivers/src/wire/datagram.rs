@@ -1,10 +1,11 @@
 //! UDP datagrams of arms, range scanners and bases: one JSON object per datagram. `docs/reference/udp.md` documents
 //! the fields.
 
-use super::Malformed;
+use super::{Malformed, json};
 use crate::RangePoint;
 use kinematics::Transform;
 use nalgebra::{Quaternion, Translation3, UnitQuaternion};
+use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
 /// Version of the format.
@@ -18,6 +19,8 @@ const MAX_ABS_VALUE: f64 = 1e4;
 const MAX_ANGLE_RAD: f64 = 100.0;
 /// Maximum number of characters of a parser message in an error.
 const MAX_ERROR_CHARS: usize = 200;
+/// Maximum length of a list of names in an error message.
+const MAX_LIST_CHARS: usize = 400;
 /// Maximum asymmetry of a covariance matrix, as a fraction of the maximum covariance. Single precision is more
 /// accurate.
 const SYMMETRY_TOLERANCE: f64 = 1e-4;
@@ -148,8 +151,9 @@ struct Pose {
     quat_xyzw: [f64; 4],
 }
 
+/// `N` is a number, or an optional one in datagrams of others.
 #[derive(Serialize, Deserialize)]
-struct WireJoints {
+struct WireJoints<N> {
     kind: String,
     version: u32,
     seq: u64,
@@ -157,11 +161,11 @@ struct WireJoints {
     stamp_nanos: i64,
     #[serde(default, skip_serializing_if = "Option::is_none")]
     names: Option<Vec<String>>,
-    position: Vec<f64>,
-    #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    velocity: Vec<f64>,
-    #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    effort: Vec<f64>,
+    position: Vec<N>,
+    #[serde(default = "Vec::new", skip_serializing_if = "Vec::is_empty")]
+    velocity: Vec<N>,
+    #[serde(default = "Vec::new", skip_serializing_if = "Vec::is_empty")]
+    effort: Vec<N>,
 }
 
 const SCAN: &str = "range";
@@ -310,26 +314,73 @@ fn covariance(numbers: Vec<f64>) -> Result<Box<[f64; 36]>, Malformed> {
     Ok(covariance)
 }
 
-/// Decodes the state of joints with these names. If the datagram has names, they must be the same in the same order.
-pub fn decode_joints(bytes: &[u8], names: &[String]) -> Result<JointsDatagram, Malformed> {
+/// Decodes the state of joints with these names; `None` if the datagram names other joints only, such as those of a gripper.
+///
+/// Joints are found by their names. Without names, the numbers must be in the order of `names`. Velocities and efforts count
+/// as not reported if one of them is null or NaN.
+pub fn decode_joints(bytes: &[u8], names: &[String]) -> Result<(DatagramHeader, Option<JointsDatagram>), Malformed> {
     check_kind(bytes, JOINTS)?;
-    let WireJoints { seq, clock, stamp_nanos, names: reported, position, velocity, effort, .. } = parse_json(bytes)?;
-    if reported.is_some_and(|reported| reported != names) {
-        return Err(invalid("names must be those of arm.joints, in the same order".to_owned()));
-    }
-    let n = names.len();
-    let check_length = |name, numbers: &[f64], may_be_empty: bool| match numbers.len() {
-        0 if may_be_empty => Ok(()),
-        len if len != n => Err(invalid(format!("{name} has {len} numbers, expected {n}, one per joint"))),
-        _ if numbers.iter().any(|number| number.abs() > MAX_ABS_VALUE) => {
-            Err(invalid(format!("{name} has an absolute value above {MAX_ABS_VALUE}")))
-        }
-        _ => Ok(()),
+    let joints: WireJoints<Option<f64>> = parse_json(bytes)?;
+    let WireJoints { seq, clock, stamp_nanos, names: reported, position, velocity, effort, .. } = joints;
+    let header = DatagramHeader { seq, clock, stamp_nanos };
+    let (order, n) = match &reported {
+        None => ((0..names.len()).collect(), names.len()),
+        Some(reported) => match order_of(names, reported)? {
+            Some(order) => (order, reported.len()),
+            None => return Ok((header, None)),
+        },
     };
-    check_length("position", &position, false)?;
-    check_length("velocity", &velocity, true)?;
-    check_length("effort", &effort, true)?;
-    Ok(JointsDatagram { header: DatagramHeader { seq, clock, stamp_nanos }, position, velocity, effort })
+    let numbers = |what: &str, numbers: &[Option<f64>], is_optional: bool| -> Result<Vec<f64>, Malformed> {
+        if is_optional && numbers.is_empty() {
+            return Ok(Vec::new());
+        }
+        if numbers.len() != n {
+            return Err(invalid(format!("{what} has {} numbers, expected {n}, one per joint", numbers.len())));
+        }
+        let ordered: Option<Vec<f64>> = order.iter().map(|ix: &usize| numbers[*ix]).collect();
+        match ordered {
+            Some(ordered) if ordered.iter().any(|number| number.abs() > MAX_ABS_VALUE) => {
+                Err(invalid(format!("{what} has an absolute value above {MAX_ABS_VALUE}")))
+            }
+            Some(ordered) => Ok(ordered),
+            None if is_optional => Ok(Vec::new()),
+            None => Err(invalid(format!("{what} has null or NaN"))),
+        }
+    };
+    let (position, velocity) = (numbers("position", &position, false)?, numbers("velocity", &velocity, true)?);
+    let effort = numbers("effort", &effort, true)?;
+    Ok((header, Some(JointsDatagram { header, position, velocity, effort })))
+}
+
+/// Index of each joint in `reported`; `None` if it contains none of the joints.
+fn order_of(joints: &[String], reported: &[String]) -> Result<Option<Vec<usize>>, Malformed> {
+    let find = |joint: &String| -> Result<Option<usize>, Malformed> {
+        let mut found = (0..reported.len()).filter(|ix| reported[*ix] == *joint);
+        let first = found.next();
+        match found.next() {
+            None => Ok(first),
+            Some(_) => Err(invalid(format!("names has {joint:?} twice"))),
+        }
+    };
+    let found = joints.iter().map(find).collect::<Result<Vec<_>, _>>()?;
+    if found.iter().all(Option::is_none) && !joints.is_empty() {
+        return Ok(None);
+    }
+    let missing = joints.iter().zip(&found).find(|(_, ix)| ix.is_none()).map(|(joint, _)| joint);
+    match missing {
+        None => Ok(Some(found.into_iter().flatten().collect())),
+        Some(missing) => {
+            let list = |names: &[String]| {
+                let names: String = names.join(", ").chars().filter(|c| !c.is_control()).take(MAX_LIST_CHARS).collect();
+                names
+            };
+            Err(invalid(format!(
+                "names lacks {missing:?}; it has {}, and arm.joints has {}",
+                list(reported),
+                list(joints)
+            )))
+        }
+    }
 }
 
 /// Positions of the echoes: one entry per direction of a part; `None` if there was no echo.
@@ -385,12 +436,18 @@ fn check_kind(bytes: &[u8], expected: &'static str) -> Result<(), Malformed> {
     }
 }
 
-fn parse_json<'a, T: Deserialize<'a>>(bytes: &'a [u8]) -> Result<T, Malformed> {
-    // The parser may repeat the sender's text, which may be long and contain anything, and the message is logged.
-    let reported = |error: serde_json::Error| {
-        error.to_string().chars().take(MAX_ERROR_CHARS).map(|c| if c.is_control() { '?' } else { c }).collect()
-    };
-    serde_json::from_slice(bytes).map_err(|error| invalid(reported(error)))
+/// Parses JSON in which `NaN` and `Infinity`, which Python writes, are read as null.
+fn parse_json<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, Malformed> {
+    let parse = |bytes: &[u8]| serde_json::from_slice(bytes).map_err(|error| invalid(reported(&error)));
+    parse(bytes).or_else(|error| match std::str::from_utf8(bytes) {
+        Ok(text) if text.contains("NaN") || text.contains("Infinity") => parse(json::nan_as_null(text).as_bytes()),
+        _ => Err(error),
+    })
+}
+
+/// The parser may repeat the sender's text, which may be long and contain anything, and the message is logged.
+fn reported(error: &serde_json::Error) -> String {
+    error.to_string().chars().take(MAX_ERROR_CHARS).map(|c| if c.is_control() { '?' } else { c }).collect()
 }
 
 fn invalid(reason: String) -> Malformed {
@@ -445,7 +502,8 @@ mod tests {
     fn datagrams_round_trip_exactly() {
         assert_eq!(decode_scan(&encode_scan(&part())).expect("own bytes"), part());
         assert_eq!(decode_pose(&encode_pose(&pose())).expect("own bytes"), pose());
-        assert_eq!(decode_joints(&encode_joints(&joints(), &names()), &names()).expect("own bytes"), joints());
+        let (header, decoded) = decode_joints(&encode_joints(&joints(), &names()), &names()).expect("own bytes");
+        assert_eq!((header, decoded), (HEADER, Some(joints())));
     }
 
     #[test]
@@ -455,7 +513,10 @@ mod tests {
         let scans: Vec<ScanPart> = examples.iter().filter_map(|text| decode_scan(text.as_bytes()).ok()).collect();
         let poses = examples.iter().filter(|text| decode_pose(text.as_bytes()).is_ok()).count();
         let names: Vec<String> = (1..=7).map(|n| format!("panda_joint{n}")).collect();
-        let joints = examples.iter().filter(|text| decode_joints(text.as_bytes(), &names).is_ok()).count();
+        let joints = examples
+            .iter()
+            .filter(|text| decode_joints(text.as_bytes(), &names).is_ok_and(|(_, joints)| joints.is_some()))
+            .count();
         assert_eq!((examples.len(), scans.len(), poses, joints), (5, 2, 1, 2));
         // The directions are ahead, one without echo, and to the left.
         let ranges = &scans[1].points;
@@ -511,11 +572,14 @@ mod tests {
     fn invalid_joints_are_named() {
         let good = String::from_utf8(encode_joints(&joints(), &names())).expect("text");
         for (from, to, named) in [
-            (r#"["a","b","c"]"#, r#"["b","a","c"]"#, "arm.joints"),
+            (r#"["a","b","c"]"#, r#"["a","x","c"]"#, "names lacks \"b\"; it has a, x, c, and arm.joints has a, b, c"),
+            (r#"["a","b","c"]"#, r#"["a","b","c","b"]"#, "names has \"b\" twice"),
+            (r#"["a","b","c"]"#, r#"["a","b","c","d"]"#, "position has 3 numbers, expected 4"),
             (r#""position":["#, r#""position":[1,"#, "position has 4"),
             (r#""position":["#, r#""position":[],"x":["#, "position has 0"),
             (r#""position":["#, r#""position":[0,1e5,0],"x":["#, "absolute value above"),
-            (r#""position":["#, r#""position":[0,null,0],"x":["#, "null"),
+            (r#""position":["#, r#""position":[0,null,0],"x":["#, "position has null or NaN"),
+            (r#""position":["#, r#""position":[0,NaN,0],"x":["#, "position has null or NaN"),
             (r#""velocity":["#, r#""velocity":[1],"x":["#, "velocity has 1"),
             (r#""version":1"#, r#""version":1,"effort":[1,2]"#, "effort has 2"),
         ] {
@@ -523,6 +587,24 @@ mod tests {
             let reported = decode_joints(good.replace(from, to).as_bytes(), &names()).expect_err(to).to_string();
             assert!(reported.contains(named), "{to}: {reported}");
         }
+    }
+
+    #[test]
+    fn joints_are_found_by_name_and_other_joints_ignored() {
+        let decode = |fields: &str| {
+            let text = format!(r#"{{"kind":"joints","version":1,"seq":1,"clock":"device","stamp_nanos":5,{fields}}}"#);
+            decode_joints(text.as_bytes(), &names()).expect(fields).1
+        };
+        let shuffled = decode(
+            r#""names":["left","c","a","right","b"],"position":[9,3,1,9,2],"velocity":[9,-3,-1,9,-2],"effort":[NaN,0,0,-Infinity,0]"#,
+        );
+        let shuffled = shuffled.expect("all joints");
+        assert_eq!((shuffled.position, shuffled.velocity), (vec![1.0, 2.0, 3.0], vec![-1.0, -2.0, -3.0]));
+        assert_eq!(shuffled.effort, [0.0; 3], "those of other joints do not matter");
+        let unknown =
+            decode(r#""position":[1,2,3],"velocity":[0,NaN,0],"effort":[null,null,null]"#).expect("all joints");
+        assert!(unknown.velocity.is_empty() && unknown.effort.is_empty());
+        assert_eq!(decode(r#""names":["left","right"],"position":[9,9]"#), None);
     }
 
     #[test]

@@ -5,6 +5,7 @@ pub mod datagram;
 pub mod descriptor;
 pub mod foxglove;
 pub mod joint_state;
+pub(crate) mod json;
 pub mod point_cloud;
 pub mod protobuf;
 

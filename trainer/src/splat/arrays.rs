@@ -3,6 +3,7 @@
 use crate::Error;
 use crate::edits::Edits;
 use rayon::prelude::*;
+use std::path::Path;
 
 /// Maximum number of color coefficients per splat (degree 3).
 const MAX_COEFFICIENTS: usize = 16;
@@ -57,6 +58,37 @@ impl SplatArrays {
             Some(splat_ix) => Err(Error::SplatArrays(format!("rotation of splat {splat_ix} has length zero"))),
             None => Ok(self),
         }
+    }
+
+    /// Like [`Self::checked`], but leaves out splats with invalid numbers and names the first of them in a warning. An
+    /// infinite opacity is limited.
+    ///
+    /// # Errors
+    /// If the arrays do not match, or no splat is valid although there are some.
+    pub(crate) fn without_invalid(mut self, path: &Path) -> Result<Self, Error> {
+        const MAX_LOGIT: f32 = 30.0;
+        self.check_lengths()?;
+        for logit in self.opacity_logits.iter_mut().filter(|logit| logit.is_infinite()) {
+            *logit = MAX_LOGIT.copysign(*logit);
+        }
+        let n_coeffs = self.n_coefficients();
+        let is_valid = |ix: usize| {
+            let shape = self.means[ix].iter().chain(&self.log_scales[ix]).chain(&self.rotations_wxyz[ix]);
+            let color = self.sh[ix * n_coeffs..(ix + 1) * n_coeffs].as_flattened();
+            let mut all = shape.chain(color).chain([&self.opacity_logits[ix]]);
+            all.all(|value| value.is_finite()) && self.rotations_wxyz[ix].iter().any(|part| *part != 0.0)
+        };
+        let n_invalid = (0..self.n_splats()).filter(|ix| !is_valid(*ix)).count();
+        if n_invalid == 0 || n_invalid == self.n_splats() {
+            return self.checked();
+        }
+        let first = (0..self.n_splats()).find(|ix| !is_valid(*ix)).unwrap_or_default();
+        log::warn!(
+            "{}: {n_invalid} of {} splats are left out, because a number of theirs is not finite or their rotation is zero; the first is splat {first}",
+            path.display(),
+            self.n_splats()
+        );
+        self.filtered(is_valid).checked()
     }
 
     /// Number of splats.

@@ -37,7 +37,8 @@ pub(super) fn read(model: &Path) -> Result<SplatArrays, Error> {
         Some(Format::Spz) => spz::read(&path),
         Some(Format::Ply) | None => ply::read(&path),
     };
-    let hint = if is_file { "; for a saved model, give its folder" } else { "" };
+    let is_in_model = is_file && path.file_name().is_some_and(|name| name == IN_FOLDER);
+    let hint = if is_in_model { "; for a saved model, give its folder" } else { "" };
     splats.map_err(|source| Error::NoSplats { path: model.to_owned(), hint, source: Box::new(source) })
 }
 

@@ -56,3 +56,7 @@ pub use trainer::SplatTrainer;
 pub use trial_steps::TrialSteps;
 pub use trials::CountPolicy;
 pub use work_counts::WorkCounts;
+
+/// Note about files that were made for another renderer.
+const ANTIALIASED: &str = "its splats were trained with the antialiasing of Mip-Splatting, which is not applied: small and distant \
+    splats are drawn too bright";

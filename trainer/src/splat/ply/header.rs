@@ -1,26 +1,40 @@
-//! The header and tables of a binary `.ply` file. Source: Turk, "The PLY Polygon File Format", 1994.
+//! The header and tables of a `.ply` file. Source: Turk, "The PLY Polygon File Format", 1994.
+
+use std::borrow::Cow;
 
 /// Maximum length of a header. Headers of splat files have about 2000 bytes.
 const MAX_HEADER_BYTES: usize = 64 * 1024;
 
 /// The tables of a file.
-pub(super) struct Header {
-    elements: Vec<Element>,
+pub(super) struct Header<'a> {
+    elements: Vec<Element<'a>>,
+    comments: Vec<String>,
 }
 
-/// One table: `count` rows of `properties`, starting at byte `start` of the file.
-struct Element {
+/// One table: `count` rows of `properties`.
+struct Element<'a> {
     name: String,
     count: usize,
-    start: usize,
     row_bytes: usize,
     properties: Vec<Property>,
+    /// The last property of an element may be a list: the types of its length and its numbers.
+    list: Option<[NumberType; 2]>,
+    /// The rows, little-endian; an error if they are not in the file.
+    rows: Result<Cow<'a, [u8]>, String>,
 }
 
 struct Property {
     name: String,
     number_type: NumberType,
     offset: usize,
+}
+
+/// How numbers are stored.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Format {
+    Ascii,
+    LittleEndian,
+    BigEndian,
 }
 
 /// Type of a stored number.
@@ -59,25 +73,58 @@ impl NumberType {
             Self::F64 => 8,
         }
     }
+
+    /// The little-endian bytes of a number in text form; `None` if it is not a number of this type.
+    fn little_endian(self, word: &str) -> Option<Vec<u8>> {
+        Some(match self {
+            Self::I8 => word.parse::<i8>().ok()?.to_le_bytes().to_vec(),
+            Self::U8 => word.parse::<u8>().ok()?.to_le_bytes().to_vec(),
+            Self::I16 => word.parse::<i16>().ok()?.to_le_bytes().to_vec(),
+            Self::U16 => word.parse::<u16>().ok()?.to_le_bytes().to_vec(),
+            Self::I32 => word.parse::<i32>().ok()?.to_le_bytes().to_vec(),
+            Self::U32 => word.parse::<u32>().ok()?.to_le_bytes().to_vec(),
+            Self::F32 => word.parse::<f32>().ok()?.to_le_bytes().to_vec(),
+            Self::F64 => word.parse::<f64>().ok()?.to_le_bytes().to_vec(),
+        })
+    }
+
+    /// The number whose little-endian bytes these are, as a length; `None` if it is not one.
+    fn length(self, bytes: &[u8]) -> Option<usize> {
+        match self {
+            Self::U8 => Some(usize::from(*bytes.first()?)),
+            Self::U16 => Some(usize::from(u16::from_le_bytes(*bytes.first_chunk()?))),
+            Self::U32 => usize::try_from(u32::from_le_bytes(*bytes.first_chunk()?)).ok(),
+            Self::I8 => usize::try_from(i8::from_le_bytes(*bytes.first_chunk()?)).ok(),
+            Self::I16 => usize::try_from(i16::from_le_bytes(*bytes.first_chunk()?)).ok(),
+            Self::I32 => usize::try_from(i32::from_le_bytes(*bytes.first_chunk()?)).ok(),
+            Self::F32 | Self::F64 => None,
+        }
+    }
 }
 
-impl Header {
-    /// Parses the header and checks that its tables fit into the file.
-    pub(super) fn parse(bytes: &[u8]) -> Result<Self, String> {
-        const END: &[u8] = b"end_header\n";
+impl<'a> Header<'a> {
+    /// Parses the header and finds the tables.
+    pub(super) fn parse(bytes: &'a [u8]) -> Result<Self, String> {
         let searched = &bytes[..bytes.len().min(MAX_HEADER_BYTES)];
-        let end = searched.windows(END.len()).position(|window| window == END);
-        let end = end.ok_or("no PLY header with Unix line endings")?;
+        let end = [&b"\nend_header\n"[..], b"\nend_header\r\n"].into_iter().find_map(|end| {
+            let at = searched.windows(end.len()).position(|window| window == end)?;
+            Some((at, at + end.len()))
+        });
+        let (end, start) = end.ok_or("it has no PLY header")?;
         let text = std::str::from_utf8(&bytes[..end]).map_err(|_| "the header is not UTF-8")?;
-        let mut header = Self { elements: Vec::new() };
-        let mut lines = text.lines();
+        let mut header = Self { elements: Vec::new(), comments: Vec::new() };
+        let mut lines = text.lines().map(|line| line.trim_end_matches('\r'));
         if lines.next() != Some("ply") {
             return Err("the header does not begin with \"ply\"".to_owned());
         }
+        let mut format = None;
         for line in lines {
-            header.parse_line(line)?;
+            header.parse_line(line, &mut format)?;
         }
-        header.locate_tables(end + END.len(), bytes.len())?;
+        match format.ok_or("the header has no line \"format\"")? {
+            Format::Ascii => header.read_ascii(&bytes[start..]),
+            format => header.locate_binary(&bytes[start..], format),
+        }
         Ok(header)
     }
 
@@ -85,57 +132,173 @@ impl Header {
         self.elements.iter().any(|element| element.name == name)
     }
 
-    /// The table of this name.
-    pub(super) fn table<'a>(&'a self, name: &str, bytes: &'a [u8]) -> Result<Table<'a>, String> {
-        let element = self.elements.iter().find(|element| element.name == name);
-        let element = element.ok_or_else(|| format!("element {name:?} is missing"))?;
-        Ok(Table { element, rows: &bytes[element.start..element.start + element.count * element.row_bytes] })
+    /// The texts of the comments.
+    pub(super) fn comments(&self) -> &[String] {
+        &self.comments
     }
 
-    fn parse_line(&mut self, line: &str) -> Result<(), String> {
+    /// The table of this name.
+    pub(super) fn table(&self, name: &str) -> Result<Table<'_>, String> {
+        let element = self.elements.iter().find(|element| element.name == name);
+        let element = element.ok_or_else(|| format!("element {name:?} is missing"))?;
+        if element.list.is_some() {
+            return Err(format!("element {name:?} has a list, expected numbers"));
+        }
+        Ok(Table { element, rows: element.rows.as_ref().map_err(Clone::clone)? })
+    }
+
+    fn parse_line(&mut self, line: &str, format: &mut Option<Format>) -> Result<(), String> {
         let words: Vec<&str> = line.split_whitespace().collect();
         match (words.as_slice(), self.elements.last_mut()) {
-            ([] | ["comment" | "obj_info", ..] | ["format", "binary_little_endian", "1.0"], _) => Ok(()),
-            (["format", other, ..], _) => Err(format!("format {other}, expected binary_little_endian 1.0")),
+            ([] | ["obj_info", ..], _) => {}
+            (["comment", ..], _) => self.comments.push(words[1..].join(" ")),
+            (["format", name, "1.0"], _) => {
+                *format = Some(match *name {
+                    "ascii" => Format::Ascii,
+                    "binary_little_endian" => Format::LittleEndian,
+                    "binary_big_endian" => Format::BigEndian,
+                    other => return Err(format!("unknown format {other:?}")),
+                });
+            }
             (["element", name, count], _) => {
                 let count = count.parse().map_err(|_| format!("element {name}: count {count:?} is not a number"))?;
-                let name = (*name).to_owned();
-                self.elements.push(Element { name, count, start: 0, row_bytes: 0, properties: Vec::new() });
-                Ok(())
+                let (name, rows) = ((*name).to_owned(), Err("it is not in the file".to_owned()));
+                self.elements.push(Element { name, count, row_bytes: 0, properties: Vec::new(), list: None, rows });
+            }
+            (["property", "list", length, word, name], Some(element)) => {
+                let types = [length, word].map(|word| NumberType::of(word));
+                let [Some(length), Some(number)] = types else {
+                    return Err(format!("property {name}: unknown type in {line:?}"));
+                };
+                if element.list.replace([length, number]).is_some() {
+                    return Err(format!("element {}: more than one list", element.name));
+                }
             }
             (["property", word, name], Some(element)) => {
                 let number_type =
                     NumberType::of(word).ok_or_else(|| format!("property {name}: unknown type {word:?}"))?;
+                if element.list.is_some() {
+                    return Err(format!("element {}: property {name:?} follows a list", element.name));
+                }
+                if element.properties.iter().any(|property| property.name == *name) {
+                    return Err(format!("element {}: two properties {name:?}", element.name));
+                }
                 element.properties.push(Property { name: (*name).to_owned(), number_type, offset: element.row_bytes });
                 element.row_bytes += number_type.bytes();
-                Ok(())
             }
-            _ => Err(format!("unknown header line {line:?}")),
-        }
-    }
-
-    fn locate_tables(&mut self, mut start: usize, file_bytes: usize) -> Result<(), String> {
-        for element in &mut self.elements {
-            element.start = start;
-            let end = element.count.checked_mul(element.row_bytes).and_then(|bytes| bytes.checked_add(start));
-            match end {
-                Some(end) if end <= file_bytes => start = end,
-                _ => return Err(format!("truncated: fewer than {} rows of {:?}", element.count, element.name)),
-            }
+            _ => return Err(format!("unknown header line {line:?}")),
         }
         Ok(())
     }
+
+    /// Finds the rows of each element. After the first that is not complete, none is.
+    fn locate_binary(&mut self, mut rest: &'a [u8], format: Format) {
+        for element in &mut self.elements {
+            let n_bytes = match element.list {
+                None => element.count.checked_mul(element.row_bytes),
+                Some(list) => lists_bytes(element, list, rest, format),
+            };
+            let Some((rows, after)) = n_bytes.and_then(|n_bytes| rest.split_at_checked(n_bytes)) else {
+                element.rows = Err(truncated(element));
+                return;
+            };
+            rest = after;
+            element.rows = Ok(match format {
+                Format::BigEndian if element.list.is_none() => swapped(element, rows).into(),
+                _ => rows.into(),
+            });
+        }
+    }
+
+    /// Converts the rows of each element to binary.
+    fn read_ascii(&mut self, text: &[u8]) {
+        let mut words = text.split(u8::is_ascii_whitespace).filter(|word| !word.is_empty());
+        let mut next = || std::str::from_utf8(words.next()?).ok();
+        for element in &mut self.elements {
+            // A number and a space take at least two bytes.
+            let n_words = element.count.checked_mul(element.properties.len() + usize::from(element.list.is_some()));
+            if n_words.is_none_or(|n_words| n_words > text.len().div_ceil(2)) {
+                element.rows = Err(truncated(element));
+                return;
+            }
+            let mut rows = Vec::with_capacity(element.count * element.row_bytes);
+            let mut read_row = || -> Option<Result<(), String>> {
+                for property in &element.properties {
+                    let word = next()?;
+                    let Some(bytes) = property.number_type.little_endian(word) else {
+                        let shown: String = word.chars().take(30).collect();
+                        return Some(Err(format!("{}: {shown:?} is not a number of this type", property.name)));
+                    };
+                    rows.extend(bytes);
+                }
+                if element.list.is_some() {
+                    let n: usize = next()?.parse().ok()?;
+                    (0..n).try_for_each(|_| next().map(drop))?;
+                }
+                Some(Ok(()))
+            };
+            let problem = (0..element.count).find_map(|row| match read_row() {
+                Some(Ok(())) => None,
+                Some(Err(reason)) => Some(format!("row {row} of {:?}: {reason}", element.name)),
+                None => Some(truncated(element)),
+            });
+            if let Some(problem) = problem {
+                element.rows = Err(problem);
+                return;
+            }
+            element.rows = Ok(rows.into());
+        }
+    }
+}
+
+fn truncated(element: &Element<'_>) -> String {
+    format!("truncated: fewer than {} rows of {:?}", element.count, element.name)
+}
+
+/// Size of the rows of an element with a list; `None` if they are not complete.
+fn lists_bytes(
+    element: &Element<'_>,
+    [length, number]: [NumberType; 2],
+    bytes: &[u8],
+    format: Format,
+) -> Option<usize> {
+    let mut at = 0_usize;
+    for _ in 0..element.count {
+        at = at.checked_add(element.row_bytes)?;
+        let mut length_bytes = bytes.get(at..at.checked_add(length.bytes())?)?.to_vec();
+        if format == Format::BigEndian {
+            length_bytes.reverse();
+        }
+        at = at.checked_add(length.bytes())?.checked_add(length.length(&length_bytes)?.checked_mul(number.bytes())?)?;
+    }
+    Some(at)
+}
+
+/// The rows with the bytes of each number in reverse order.
+fn swapped(element: &Element<'_>, rows: &[u8]) -> Vec<u8> {
+    let mut rows = rows.to_vec();
+    for row in rows.chunks_exact_mut(element.row_bytes.max(1)) {
+        for property in &element.properties {
+            row[property.offset..property.offset + property.number_type.bytes()].reverse();
+        }
+    }
+    rows
 }
 
 /// One table of a file.
 pub(super) struct Table<'a> {
-    element: &'a Element,
+    element: &'a Element<'a>,
     rows: &'a [u8],
 }
 
 impl<'a> Table<'a> {
     pub(super) fn n_rows(&self) -> usize {
         self.element.count
+    }
+
+    /// Names of the properties.
+    pub(super) fn names(&self) -> impl Iterator<Item = &'a str> {
+        self.element.properties.iter().map(|property| property.name.as_str())
     }
 
     pub(super) fn column(&self, name: &str) -> Result<Column<'a>, String> {
@@ -171,6 +334,16 @@ impl Column<'_> {
             NumberType::F32 => f32::from_le_bytes(self.bytes(row)),
             NumberType::F64 => f64::from_le_bytes(self.bytes(row)) as f32,
         }
+    }
+
+    /// The value as a color channel from 0 to 1: integers are divided by their maximum.
+    pub(super) fn channel(&self, row: usize) -> f32 {
+        let max = match self.property.number_type {
+            NumberType::U8 => f32::from(u8::MAX),
+            NumberType::U16 => f32::from(u16::MAX),
+            _ => 1.0,
+        };
+        self.f32(row) / max
     }
 
     /// The value as packed bits. Fails if the property is not an unsigned 32-bit integer.

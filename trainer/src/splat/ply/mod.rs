@@ -10,11 +10,25 @@ use header::{Column, Header, Table};
 use std::io::{BufWriter, Write};
 use std::path::Path;
 
-/// Reads a `.ply` file of splats. Properties may have any order and number type. The number of `f_rest_*` properties
-/// determines the SH degree.
+/// Constant factor of the first spherical harmonic, `1 / (2 sqrt(pi))`.
+const SH_0: f32 = 0.282_094_8;
+/// Thickness of a flat splat (2D Gaussian splatting), relative to its smaller radius, as a logarithm.
+const LOG_FLATNESS: f32 = -7.0;
+/// Properties of splats that are not used: normals, which are zero in these files, and names of other programs for numbers
+/// that do not affect pictures.
+const UNUSED: [&str; 5] = ["nx", "ny", "nz", "label", "id"];
+
+/// Reads a `.ply` file of splats. Properties may have any order and number type, and the file any format. The number of
+/// `f_rest_*` properties determines the SH degree.
+///
+/// Splats with invalid numbers are left out, and properties that are not used are named, both with a warning.
 pub fn read(path: &Path) -> Result<SplatArrays, Error> {
     let bytes = files::read(path, files::NO_LIMIT).map_err(|source| Error::Read { path: path.to_owned(), source })?;
-    from_bytes(&bytes).map_err(|reason| Error::SplatFile { path: path.to_owned(), reason })?.checked()
+    let (splats, notes) = from_bytes(&bytes).map_err(|reason| Error::SplatFile { path: path.to_owned(), reason })?;
+    for note in notes {
+        log::warn!("{}: {note}", path.display());
+    }
+    splats.without_invalid(path)
 }
 
 /// Writes a `.ply` file of splats as little-endian f32. A failed write leaves no partial file at `path`.
@@ -27,58 +41,151 @@ pub fn write(path: &Path, splats: &SplatArrays) -> Result<(), Error> {
     written.map_err(|source| Error::Write { path: path.to_owned(), source })
 }
 
-fn from_bytes(bytes: &[u8]) -> Result<SplatArrays, String> {
+/// The splats, and notes about what is not used.
+fn from_bytes(bytes: &[u8]) -> Result<(SplatArrays, Vec<String>), String> {
     let header = Header::parse(bytes)?;
-    if header.has_element("chunk") {
-        return packed::splats(&header, bytes);
+    let mut notes = Vec::new();
+    if header.comments().iter().any(|comment| comment.to_ascii_lowercase().replace(' ', "") == "splatrendermode:mip") {
+        notes.push(crate::splat::ANTIALIASED.to_owned());
     }
-    let vertices = header.table("vertex", bytes)?;
-    let [means, log_scales] = [["x", "y", "z"], ["scale_0", "scale_1", "scale_2"]].map(|names| vertices.columns(names));
+    if header.has_element("chunk") {
+        return Ok((packed::splats(&header)?, notes));
+    }
+    let vertices = header.table("vertex")?;
+    let names: Vec<&str> = vertices.names().collect();
+    let is_splat = |name: &&str| name.starts_with("scale_") || name.starts_with("rot_") || *name == "opacity";
+    if !names.iter().any(is_splat) {
+        return Err("it is a point cloud or a mesh: its vertices have no scales, rotations and opacities".to_owned());
+    }
+    let means = vertices.columns(["x", "y", "z"])?;
+    let scales = Scales::of(&vertices)?;
     let rotations = vertices.columns(["rot_0", "rot_1", "rot_2", "rot_3"])?;
     let opacity = vertices.column("opacity")?;
-    let color = ColorColumns::of(&vertices, &vertices)?;
-    let (means, log_scales) = (means?, log_scales?);
+    let color = ColorColumns::of(&vertices)?;
+    notes.extend(color.note());
+    let filter = vertices.column("filter_3D").ok();
+    let unused: Vec<&str> = names.iter().copied().filter(|name| !is_used(name, &color)).collect();
+    if !unused.is_empty() {
+        notes.push(format!("properties that are not used: {}", unused.join(", ")));
+    }
     let rows = 0..vertices.n_rows();
-    Ok(SplatArrays {
+    let mut splats = SplatArrays {
         means: rows.clone().map(|row| means.each_ref().map(|column| column.f32(row))).collect(),
-        log_scales: rows.clone().map(|row| log_scales.each_ref().map(|column| column.f32(row))).collect(),
+        log_scales: rows.clone().map(|row| scales.log_scales(row)).collect(),
         rotations_wxyz: rows.clone().map(|row| rotations.each_ref().map(|column| column.f32(row))).collect(),
         opacity_logits: rows.clone().map(|row| opacity.f32(row)).collect(),
-        sh: rows.flat_map(|row| color.coefficients(row)).collect(),
+        sh: rows.clone().flat_map(|row| color.coefficients(row)).collect(),
         sh_degree: color.degree,
-    })
+    };
+    if let Some(filter) = filter {
+        rows.for_each(|row| widen(&mut splats, row, filter.f32(row)));
+    }
+    Ok((splats, notes))
+}
+
+fn is_used(name: &str, color: &ColorColumns<'_>) -> bool {
+    let is_color = match color.constant {
+        ConstantColor::Coefficients(_) => name.starts_with("f_dc_"),
+        ConstantColor::Channels(_) => ["red", "green", "blue"].contains(&name),
+    };
+    let known = ["x", "y", "z", "opacity", "filter_3D"];
+    is_color
+        || known.contains(&name)
+        || UNUSED.contains(&name)
+        || ["scale_", "rot_", "f_rest_"].iter().any(|start| name.starts_with(start))
+}
+
+/// Applies the 3D filter of Mip-Splatting (Yu et al. 2024), as its renderer does: the splat becomes wider by the filter's
+/// width, and its opacity lower by the ratio of the volumes.
+fn widen(splats: &mut SplatArrays, row: usize, filter_m: f32) {
+    let variances = splats.log_scales[row].map(|log_scale| (2.0 * log_scale).exp());
+    let widened = variances.map(|variance| variance + filter_m * filter_m);
+    let ratio = variances.iter().zip(&widened).map(|(before, after)| before / after).product::<f32>().sqrt();
+    let opacity = ratio / (1.0 + (-splats.opacity_logits[row]).exp());
+    splats.log_scales[row] = widened.map(|variance| 0.5 * variance.ln());
+    splats.opacity_logits[row] = (opacity / (1.0 - opacity)).ln();
+}
+
+/// The columns of the scales.
+enum Scales<'a> {
+    Solid([Column<'a>; 3]),
+    /// Disks, of 2D Gaussian splatting (Huang et al. 2024). Their normal is the third axis.
+    Flat([Column<'a>; 2]),
+}
+
+impl<'a> Scales<'a> {
+    fn of(vertices: &Table<'a>) -> Result<Self, String> {
+        match vertices.columns(["scale_0", "scale_1", "scale_2"]) {
+            Ok(columns) => Ok(Self::Solid(columns)),
+            Err(_) => vertices.columns(["scale_0", "scale_1"]).map(Self::Flat),
+        }
+    }
+
+    fn log_scales(&self, row: usize) -> [f32; 3] {
+        match self {
+            Self::Solid(columns) => columns.each_ref().map(|column| column.f32(row)),
+            Self::Flat(columns) => {
+                let [a, b] = columns.each_ref().map(|column| column.f32(row));
+                [a, b, a.min(b) + LOG_FLATNESS]
+            }
+        }
+    }
 }
 
 /// The columns of the color coefficients. Files store all higher coefficients of red, then of green, then of blue.
 struct ColorColumns<'a> {
     degree: u32,
-    constant: [Column<'a>; 3],
+    constant: ConstantColor<'a>,
     rest: Vec<Column<'a>>,
+    /// Higher coefficients per channel in the file; more than are used if the file has a higher degree.
+    n_rest: usize,
+}
+
+enum ConstantColor<'a> {
+    Coefficients([Column<'a>; 3]),
+    /// Red, green and blue of the splat, without a dependence on the direction.
+    Channels([Column<'a>; 3]),
 }
 
 impl<'a> ColorColumns<'a> {
-    fn of(constant: &Table<'a>, rest: &Table<'a>) -> Result<Self, String> {
-        let (degree, rest) = rest_columns(rest)?;
-        Ok(Self { degree, constant: constant.columns(["f_dc_0", "f_dc_1", "f_dc_2"])?, rest })
+    fn of(vertices: &Table<'a>) -> Result<Self, String> {
+        let (degree, rest) = rest_columns(vertices)?;
+        let n_rest = rest.len() / 3;
+        let constant = match vertices.columns(["f_dc_0", "f_dc_1", "f_dc_2"]) {
+            Ok(columns) => ConstantColor::Coefficients(columns),
+            Err(missing) => {
+                let channels = vertices.columns(["red", "green", "blue"]).map_err(|_| missing)?;
+                ConstantColor::Channels(channels)
+            }
+        };
+        Ok(Self { degree, constant, rest, n_rest })
+    }
+
+    fn note(&self) -> Option<String> {
+        let n_used = (self.degree as usize + 1).pow(2) - 1;
+        (self.n_rest > n_used).then(|| "its color coefficients above degree 3 are not used".to_owned())
     }
 
     fn coefficients(&self, row: usize) -> Vec<[f32; 3]> {
-        let n_rest = self.rest.len() / 3;
-        let constant = self.constant.each_ref().map(|column| column.f32(row));
-        let rest = (0..n_rest).map(|ix| std::array::from_fn(|color| self.rest[color * n_rest + ix].f32(row)));
+        let constant = match &self.constant {
+            ConstantColor::Coefficients(columns) => columns.each_ref().map(|column| column.f32(row)),
+            ConstantColor::Channels(columns) => columns.each_ref().map(|column| (column.channel(row) - 0.5) / SH_0),
+        };
+        let n_used = (self.degree as usize + 1).pow(2) - 1;
+        let rest = (0..n_used).map(|ix| std::array::from_fn(|color| self.rest[color * self.n_rest + ix].f32(row)));
         std::iter::once(constant).chain(rest).collect()
     }
 }
 
-/// SH degree and the columns `f_rest_*`.
+/// SH degree that is used, and the columns `f_rest_*`.
 fn rest_columns<'a>(table: &Table<'a>) -> Result<(u32, Vec<Column<'a>>), String> {
     let rest: Vec<_> = (0..).map_while(|ix| table.column(&format!("f_rest_{ix}")).ok()).collect();
     let degree = match rest.len() {
         0 => 0,
         9 => 1,
         24 => 2,
-        45 => 3,
-        other => return Err(format!("found {other} f_rest_* properties, expected 0, 9, 24 or 45")),
+        45 | 72 => 3,
+        other => return Err(format!("found {other} f_rest_* properties, expected 0, 9, 24, 45 or 72")),
     };
     Ok((degree, rest))
 }

@@ -2,20 +2,18 @@
 //! color coefficients have 8 bits each.
 
 use super::header::{Column, Header, Table};
-use super::rest_columns;
+use super::{SH_0, rest_columns};
 use crate::splat::arrays::SplatArrays;
 
 const SPLATS_PER_CHUNK: usize = 256;
-/// Constant factor of the first spherical harmonic, `1 / (2 sqrt(pi))`.
-const SH_0: f32 = 0.282_094_8;
 /// Size of the range of the higher color coefficients, -4 to 4.
 const REST_SPAN: f32 = 8.0;
 /// Half a step. Opacities stay at least this far from 0 and 1, where the logit is infinite.
 const MIN_OPACITY: f32 = 0.5 / 255.0;
 
 /// Unpacks the splats of a file.
-pub(super) fn splats(header: &Header, bytes: &[u8]) -> Result<SplatArrays, String> {
-    let (chunks, vertices) = (header.table("chunk", bytes)?, header.table("vertex", bytes)?);
+pub(super) fn splats(header: &Header<'_>) -> Result<SplatArrays, String> {
+    let (chunks, vertices) = (header.table("chunk")?, header.table("vertex")?);
     if vertices.n_rows().div_ceil(SPLATS_PER_CHUNK) != chunks.n_rows() {
         return Err(format!("{} splats do not match {} chunks of 256", vertices.n_rows(), chunks.n_rows()));
     }
@@ -23,7 +21,7 @@ pub(super) fn splats(header: &Header, bytes: &[u8]) -> Result<SplatArrays, Strin
     let packed = vertices.columns(["packed_position", "packed_rotation", "packed_scale", "packed_color"])?;
     let (sh_degree, rest) = match header.has_element("sh") {
         true => {
-            let sh = header.table("sh", bytes)?;
+            let sh = header.table("sh")?;
             if sh.n_rows() != vertices.n_rows() {
                 return Err(format!("element \"sh\" has {} rows, expected {}", sh.n_rows(), vertices.n_rows()));
             }

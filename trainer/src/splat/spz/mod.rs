@@ -25,10 +25,15 @@ const HEADER_BYTES: usize = 16;
 const MIN_VERSION: u32 = 2;
 /// Newest supported version, and the version that is written. Later versions are not gzip streams.
 const MAX_VERSION: u32 = 3;
+/// Header flag: the splats were trained with the opacity correction of Mip-Splatting.
+const IS_ANTIALIASED: u8 = 1;
 /// Header flag: extensions follow the splats.
 const HAS_EXTENSIONS: u8 = 2;
 /// Maximum number of splats. A larger number in a header indicates damage.
 const MAX_SPLATS: u32 = 100_000_000;
+/// Splats are compressed by a factor of 2 to 4. Larger bodies are accepted up to this factor, or this size.
+const MAX_COMPRESSION: u64 = 50;
+const MIN_COMPRESSED_BYTES: u64 = 64 << 20;
 /// Maximum number of fractional bits of a mean, for steps of 15 micrometers.
 const MAX_FRACTIONAL_BITS: u8 = 16;
 /// Factors of the higher color coefficients when y and z change their signs: -1 for basis functions that change sign.
@@ -37,7 +42,11 @@ const SH_SIGNS: [f32; 15] = [-1.0, -1.0, 1.0, -1.0, 1.0, 1.0, -1.0, 1.0, -1.0, 1
 /// Reads a `.spz` file of splats.
 pub fn read(path: &Path) -> Result<SplatArrays, Error> {
     let bytes = files::read(path, files::NO_LIMIT).map_err(|source| Error::Read { path: path.to_owned(), source })?;
-    from_bytes(&bytes).map_err(|reason| Error::SplatFile { path: path.to_owned(), reason })?.checked()
+    let (splats, notes) = from_bytes(&bytes).map_err(|reason| Error::SplatFile { path: path.to_owned(), reason })?;
+    for note in notes {
+        log::warn!("{}: {note}", path.display());
+    }
+    splats.without_invalid(path)
 }
 
 /// Writes a `.spz` file of splats. A failed write leaves no partial file at `path`.
@@ -83,6 +92,21 @@ impl Header {
         Ok(Self { version, n_splats: n_splats as usize, sh_degree: sh_degree.into(), fractional_bits, flags })
     }
 
+    fn notes(&self, n_extension_bytes: u64) -> Vec<String> {
+        let mut notes = Vec::new();
+        if self.flags & IS_ANTIALIASED != 0 {
+            notes.push(crate::splat::ANTIALIASED.to_owned());
+        }
+        if n_extension_bytes > 0 {
+            notes.push(format!("{n_extension_bytes} bytes of extensions are not used"));
+        }
+        let unknown = self.flags & !(IS_ANTIALIASED | HAS_EXTENSIONS);
+        if unknown != 0 {
+            notes.push(format!("the unknown header flags {unknown:#x} are not used"));
+        }
+        notes
+    }
+
     fn n_higher_coefficients(&self) -> usize {
         (self.sh_degree as usize + 1).pow(2) - 1
     }
@@ -104,7 +128,8 @@ fn check_version(version: u32) -> Result<(), String> {
     }
 }
 
-fn from_bytes(bytes: &[u8]) -> Result<SplatArrays, String> {
+/// The splats, and notes about what is not used.
+fn from_bytes(bytes: &[u8]) -> Result<(SplatArrays, Vec<String>), String> {
     if let [b'N', b'G', b'S', b'P', version @ ..] = bytes
         && let Some(version) = version.first_chunk()
     {
@@ -117,6 +142,14 @@ fn from_bytes(bytes: &[u8]) -> Result<SplatArrays, String> {
     let mut header = [0; HEADER_BYTES];
     gzip.read_exact(&mut header).map_err(|error| read_error(&error))?;
     let header = Header::parse(header)?;
+    let max_body_bytes = MIN_COMPRESSED_BYTES.max(MAX_COMPRESSION * bytes.len() as u64);
+    if header.n_body_bytes() > max_body_bytes {
+        return Err(format!(
+            "the header specifies {} splats, which a file of {} bytes cannot contain",
+            header.n_splats,
+            bytes.len()
+        ));
+    }
     let mut body = Vec::new();
     gzip.by_ref().take(header.n_body_bytes()).read_to_end(&mut body).map_err(|error| read_error(&error))?;
     if (body.len() as u64) < header.n_body_bytes() {
@@ -129,7 +162,7 @@ fn from_bytes(bytes: &[u8]) -> Result<SplatArrays, String> {
         return Err(format!("{n_more} bytes follow the last splat"));
     }
     match gzip.into_inner().len() {
-        0 => Ok(splats(&header, &body)),
+        0 => Ok((splats(&header, &body), header.notes(n_more))),
         n => Err(format!("{n} bytes follow the gzip stream")),
     }
 }

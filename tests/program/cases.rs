@@ -1,0 +1,245 @@
+//! Inputs of the kinds that people met, in `shared/data/cases` and `shared/data/hostile`, with the right answers. Each test
+//! is skipped where they are absent.
+#![expect(clippy::unwrap_used, reason = "a test that cannot continue may panic")]
+
+use serde_json::Value;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+/// A copy of a case, in which outputs may be written.
+struct Case {
+    folder: tempfile::TempDir,
+}
+
+impl Case {
+    fn open(name: &str) -> Option<Self> {
+        let folder = tempfile::tempdir().unwrap();
+        tree_copy(&test_support::data_folder(name)?, folder.path());
+        Some(Self { folder })
+    }
+
+    fn at(&self, name: &str) -> PathBuf {
+        self.folder.path().join(name)
+    }
+
+    /// Exit code and everything that is printed.
+    fn run(&self, args: &[&str]) -> (Option<i32>, String) {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_fieldrig"));
+        let output = command.args(args).current_dir(self.folder.path()).output().unwrap();
+        (output.status.code(), String::from_utf8_lossy(&[output.stdout, output.stderr].concat()).into_owned())
+    }
+
+    /// Trains for three steps; returns the exit code, what is printed, and the images with their poses by name.
+    fn train(&self, data: &str, out: &str) -> (Option<i32>, String, Vec<(String, Vec<f64>)>) {
+        let (code, printed) = self.run(&["train", data, "--steps", "3", "--max-splats", "200", "--out", out]);
+        let cameras = std::fs::read_to_string(self.at(out).join("cameras.json")).unwrap_or_else(|_| "{}".to_owned());
+        let cameras: Value = serde_json::from_str(&cameras).unwrap();
+        let pose = |camera: &Value| -> Vec<f64> {
+            camera["world_from_camera"].as_array().unwrap().iter().map(|number| number.as_f64().unwrap()).collect()
+        };
+        let camera =
+            |camera: &Value| (format!("{} {}", camera["split"].as_str().unwrap(), camera["stamp_nanos"]), pose(camera));
+        let cameras = cameras["cameras"].as_array().map(|cameras| cameras.iter().map(camera).collect());
+        (code, printed, cameras.unwrap_or_default())
+    }
+}
+
+/// Copies a folder whose files may be read-only.
+fn tree_copy(from: &Path, to: &Path) {
+    std::fs::create_dir_all(to).unwrap();
+    for entry in std::fs::read_dir(from).unwrap() {
+        let path = entry.unwrap().path();
+        let target = to.join(path.file_name().unwrap());
+        match path.is_dir() {
+            true => tree_copy(&path, &target),
+            false => std::fs::write(target, std::fs::read(&path).unwrap()).unwrap(),
+        }
+    }
+}
+
+fn max_difference(a: &[f64], b: &[f64]) -> f64 {
+    assert_eq!(a.len(), b.len());
+    a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max)
+}
+
+#[test]
+fn half_written_urdf() {
+    let Some(case) = Case::open("cases/urdf_half_written") else { return };
+    let fk = |file: &str| case.run(&["fk", file, "--tip", "c", "--joints", "q.json"]);
+    let poses = |printed: &str| printed.lines().find(|line| line.starts_with('{')).map(str::to_owned);
+    let expected = poses(&fk("base.urdf").1).unwrap();
+    for (file, warning) in [
+        ("inertia_garbage.urdf", r#"line 1: the inertia of link "b""#),
+        ("inertial_no_mass.urdf", r#"line 1: the inertia of link "b""#),
+        ("limit_no_velocity.urdf", ""),
+        ("limit_swapped.urdf", r#"joint "j1": its range is 1 to -1"#),
+        ("material_no_name.urdf", ""),
+        ("texture_no_filename.urdf", r#"a texture of link "b""#),
+    ] {
+        let (code, printed) = fk(file);
+        assert_eq!((code, poses(&printed).as_ref()), (Some(0), Some(&expected)), "{file}: {printed}");
+        assert!(printed.contains(warning), "{file}: {printed}");
+    }
+    for file in ["xacro_left.urdf", "comma_xyz.urdf"] {
+        let (code, printed) = fk(file);
+        assert!(code == Some(1) && printed.contains(r#"urdf: line 1: joint "j2": xyz of <origin> is"#), "{printed}");
+    }
+}
+
+#[test]
+fn hostile_urdf() {
+    let Some(case) = Case::open("hostile/urdf-mimic-5000") else { return };
+    std::fs::write(case.at("jm.json"), r#"{"joint_names": ["j0"], "configurations": [[0.25]]}"#).unwrap();
+    let (code, printed) = case.run(&["fk", "--tip", "l5000", "--joints", "jm.json", "u.urdf"]);
+    assert!(code == Some(0) && printed.contains("\"poses\""), "{printed}");
+    let deep =
+        format!("<robot name=\"r\">{}{}<link name=\"l0\"/></robot>", "<a>".repeat(20_000), "</a>".repeat(20_000));
+    std::fs::write(case.at("deep.urdf"), deep).unwrap();
+    std::fs::write(case.at("j.json"), r#"{"joint_names": [], "configurations": [[]]}"#).unwrap();
+    let (code, printed) = case.run(&["fk", "--tip", "l0", "--joints", "j.json", "deep.urdf"]);
+    assert_eq!(code, Some(0), "{printed}");
+}
+
+#[test]
+fn camera_paths_of_the_viewer() {
+    let Some(case) = Case::open("cases") else { return };
+    let render = |path: &str, extra: &[&str], out: &str| {
+        let path = format!("camera_path_float_size/{path}");
+        let words = ["render", "splats_headers/plain.ply", "--camera-path", &path, "--out", out];
+        case.run(&[&words, extra].concat())
+    };
+    let picture = |out: &str| std::fs::read(case.at(out).join("00000.png")).unwrap();
+    for (file, out) in [("int.json", "int"), ("float.json", "float"), ("crop.json", "crop")] {
+        let (code, printed) = render(file, &[], out);
+        assert_eq!(code, Some(0), "{printed}");
+        assert_eq!(printed.contains("\"crop\" is not used; use --crop"), file == "crop.json", "{printed}");
+        assert_eq!(picture(out), picture("int"));
+    }
+    let (code, printed) = render("equirect.json", &[], "none");
+    assert!(code == Some(2) && printed.contains("add --equirect"), "{printed}");
+    let (code, printed) = render("equirect.json", &["--equirect"], "panorama");
+    assert_eq!(code, Some(0), "{printed}");
+    assert!(picture("panorama") != picture("int"));
+}
+
+#[test]
+fn splat_files_of_other_programs() {
+    let Some(case) = Case::open("cases") else { return };
+    let render = |file: &str, out: &str| {
+        let words = ["render", file, "--camera-path", "camera_path_float_size/int.json", "--out", out];
+        case.run(&words)
+    };
+    let picture = |out: &str| image::open(case.at(out).join("00000.png")).unwrap().into_rgb8();
+    let names = ["plain", "crlf", "faces_after", "ascii", "big_endian", "rgb_mode", "2dgs"];
+    for name in names {
+        let (code, printed) = render(&format!("splats_headers/{name}.ply"), name);
+        assert_eq!(code, Some(0), "{name}: {printed}");
+    }
+    for name in &names[1..5] {
+        assert!(picture(name) == picture("plain"), "{name}");
+    }
+    let covered = |out: &str| {
+        let picture = picture(out);
+        let background = *picture.get_pixel(0, 0);
+        picture.pixels().filter(|pixel| **pixel != background).count()
+    };
+    assert!(covered("rgb_mode") > 10 && covered("2dgs") > 10);
+    let (code, printed) = render("splats_headers/points3D.ply", "points");
+    assert!(code == Some(1) && printed.contains("it is a point cloud or a mesh"), "{printed}");
+    for file in ["mip.ply", "mip.spz"] {
+        let (code, printed) = render(&format!("splats_antialiased/{file}"), file);
+        assert!(code == Some(0) && printed.contains("Mip-Splatting"), "{printed}");
+    }
+}
+
+#[test]
+fn masks_that_leave_nothing() {
+    let Some(case) = Case::open("cases/everything_masked") else { return };
+    for (data, hint) in [(".", "its alpha channel differs"), ("transparent.json", "black in a mask means")] {
+        let (code, printed, _) = case.train(data, "r");
+        assert_eq!(code, Some(4), "{printed}");
+        assert!(printed.contains("no pixel of any image can be used") && printed.contains(hint), "{printed}");
+    }
+    let Some(hostile) = Case::open("hostile/all-masked") else { return };
+    assert_eq!(hostile.train(".", "r").0, Some(4));
+}
+
+#[test]
+fn image_formats() {
+    let Some(case) = Case::open("cases/image_formats") else { return };
+    for (data, n_images) in [("webp", 8), ("noext_upper", 8)] {
+        let (code, printed, cameras) = case.train(data, &format!("r-{data}"));
+        assert_eq!((code, cameras.len()), (Some(0), n_images), "{printed}");
+    }
+    let (code, printed, _) = case.train("heic", "r-heic");
+    assert!(code == Some(1) && printed.contains("is a HEIC file") && printed.contains("convert it"), "{printed}");
+    let (code, printed, cameras) = case.train("depth_npy", "r-npy");
+    assert_eq!((code, cameras.len()), (Some(3), 8), "{printed}");
+    assert!(printed.contains("depth 16-bit PNG") && !printed.contains("007.npy"), "{printed}");
+}
+
+#[test]
+fn initial_points_are_named() {
+    let Some(case) = Case::open("cases/initial_points") else { return };
+    let (code, printed, _) = case.train(".", "r");
+    assert!(code == Some(0) && printed.contains("the points in ply_file_path (\"sparse_pc.ply\")"), "{printed}");
+}
+
+#[test]
+fn split_lists_of_nerfstudio() {
+    let Some(case) = Case::open("cases/nerfstudio_split_lists") else { return };
+    let (code, printed, cameras) = case.train(".", "r");
+    assert_eq!(code, Some(0), "{printed}");
+    let tests: Vec<&str> =
+        cameras.iter().map(|(name, _)| name.as_str()).filter(|name| name.starts_with("test")).collect();
+    assert_eq!(tests, ["test 6000000", "test 7000000"]);
+}
+
+#[test]
+fn poses_with_three_decimals() {
+    let Some(case) = Case::open("cases/poses_with_three_decimals") else { return };
+    let (code, printed, cameras) = case.train(".", "r");
+    assert_eq!((code, cameras.len()), (Some(0), 8), "{printed}");
+    assert!(printed.contains("poses with rounded numbers"), "{printed}");
+}
+
+#[test]
+fn tum_times_and_poses() {
+    let Some(case) = Case::open("cases/tum_scientific_notation") else { return };
+    let (_, _, plain) = case.train("plain", "p");
+    assert_eq!(plain.len(), 16);
+    for data in ["relative", "epoch"] {
+        let (code, printed, cameras) = case.train(data, &format!("r-{data}"));
+        assert_eq!((code, cameras.len()), (Some(0), 16), "{data}: {printed}");
+        for (a, b) in cameras.iter().zip(&plain) {
+            assert!(max_difference(&a.1, &b.1) < 1e-6, "{data}: {} at another pose than {}", a.0, b.0);
+        }
+    }
+    let Some(case) = Case::open("cases/tum_poses_at_20_hz") else { return };
+    let (code, printed, cameras) = case.train(".", "r");
+    assert!(code == Some(0) && cameras.len() == 8, "{printed}");
+}
+
+#[test]
+fn paths_of_windows() {
+    let Some(case) = Case::open("cases/windows_paths") else { return };
+    for data in [".", "bom.json"] {
+        let (code, printed, cameras) = case.train(data, &format!("r{}", data.len()));
+        assert_eq!((code, cameras.len()), (Some(0), 8), "{printed}");
+    }
+}
+
+/// The answer names the size, and memory stays small.
+#[test]
+fn huge_depth() {
+    let Some(hostile) = test_support::data_folder("hostile/depth-16384") else { return };
+    let Some(case) = Case::open("cases/nerfstudio_split_lists") else { return };
+    let transforms = std::fs::read_to_string(case.at("transforms.json")).unwrap();
+    let mut transforms: Value = serde_json::from_str(&transforms).unwrap();
+    std::fs::copy(hostile.join("depth.png"), case.at("huge.png")).unwrap();
+    transforms["frames"][0]["depth_file_path"] = "huge.png".into();
+    std::fs::write(case.at("transforms.json"), transforms.to_string()).unwrap();
+    let (code, printed, cameras) = case.train(".", "r");
+    assert_eq!((code, cameras.len()), (Some(3), 8), "{printed}");
+    assert!(printed.contains("has 16384x16384 pixels, at most"), "{printed}");
+}
