@@ -2,21 +2,24 @@
 //!
 //! A command whose result is its output (`devices`, `metrics`) prints with [`line()`] and [`json`], which fail if
 //! stdout fails. A command whose result is a file (`train`, `run`, `record`) prints with [`report`] and
-//! [`report_json`], which never fail: a closed terminal or a full disk loses lines, not the model. A separate thread
-//! writes the lines, so that a terminal that accepts no output does not block the program. [`has_lost_output`] returns
-//! whether any lines were lost.
+//! [`report_json`], which never fail: a closed terminal or a full disk loses lines, not the model. A thread per stream
+//! writes the lines, so that a terminal or a program that accepts no output blocks neither this program nor the other
+//! stream. [`has_lost_output`] returns whether any lines of stdout were lost.
+//!
+//! Text may come from files and other programs, so control characters, which terminals may obey, are escaped in it.
 
 use anyhow::Context;
 use console::Term;
 use indicatif::{MultiProgress, ProgressBar, ProgressDrawTarget, ProgressStyle, TermLike};
 use parking_lot::Mutex;
 use serde::Serialize;
+use std::borrow::Cow;
 use std::fmt::Display;
 use std::io::Write;
 use std::sync::LazyLock;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{SyncSender, sync_channel};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 /// Writing to stdout failed.
 #[derive(Debug, thiserror::Error)]
@@ -34,33 +37,68 @@ const MAX_WAITING: usize = 4096;
 /// At exit, the program waits at most this long for its output to be written.
 const MAX_FLUSH: Duration = Duration::from_secs(5);
 
-/// A chunk of output for one stream.
+/// A command waits at most this long for the log before it prints a line of its result.
+const MAX_ORDERING: Duration = Duration::from_millis(200);
+
+/// A part of the output of one stream.
 enum OutputChunk {
-    Out(Vec<u8>),
-    Err(Vec<u8>),
+    Bytes(Vec<u8>),
     /// Acknowledged once everything before it has been written.
     Flush(SyncSender<()>),
 }
 
-/// Sends output to the thread that writes it.
-static WRITER: LazyLock<SyncSender<OutputChunk>> = LazyLock::new(|| {
-    let (sender, chunks) = sync_channel(MAX_WAITING);
-    std::thread::spawn(move || chunks.into_iter().for_each(write));
-    sender
+/// Send output to the threads that write it.
+static STDOUT: LazyLock<SyncSender<OutputChunk>> = LazyLock::new(|| {
+    writer(|bytes| {
+        let mut stdout = std::io::stdout().lock();
+        if let Err(error) = stdout.write_all(bytes).and_then(|()| stdout.flush()) {
+            log_lost(&error.to_string());
+        }
+    })
+});
+static STDERR: LazyLock<SyncSender<OutputChunk>> = LazyLock::new(|| {
+    // The output is lost if the terminal is closed or the disk is full.
+    writer(|bytes| drop(std::io::stderr().write_all(bytes)))
 });
 
-fn write(chunk: OutputChunk) {
-    match chunk {
-        OutputChunk::Out(bytes) => {
-            let mut stdout = std::io::stdout().lock();
-            if let Err(error) = stdout.write_all(&bytes).and_then(|()| stdout.flush()) {
-                log_lost(&error.to_string());
+/// Starts a thread that writes. If it cannot be started, the output is lost.
+fn writer(write: fn(&[u8])) -> SyncSender<OutputChunk> {
+    let (sender, chunks) = sync_channel(MAX_WAITING);
+    let write_all = move || {
+        for chunk in chunks {
+            match chunk {
+                OutputChunk::Bytes(bytes) => write(&bytes),
+                OutputChunk::Flush(done) => drop(done.send(())),
             }
         }
-        // The output is lost if the terminal is closed or the disk is full.
-        OutputChunk::Err(bytes) => drop(std::io::stderr().write_all(&bytes)),
-        OutputChunk::Flush(done) => drop(done.send(())),
+    };
+    if std::thread::Builder::new().name("output".to_owned()).spawn(write_all).is_err() {
+        LOST_OUTPUT.store(true, Ordering::Relaxed);
     }
+    sender
+}
+
+/// Sends text to a stream; returns whether it has room. The progress bars are hidden meanwhile.
+fn send(stream: &SyncSender<OutputChunk>, text: String) -> bool {
+    BARS.suspend(|| stream.try_send(OutputChunk::Bytes(text.into_bytes())).is_ok())
+}
+
+/// Escapes control characters other than line breaks and tabs, and characters that change the direction of text.
+fn printable(text: &str) -> Cow<'_, str> {
+    let is_hidden = |c: char| {
+        (c.is_control() && !matches!(c, '\n' | '\t')) || matches!(c, '\u{202A}'..='\u{202E}' | '\u{2066}'..='\u{2069}')
+    };
+    if !text.contains(is_hidden) {
+        return text.into();
+    }
+    let mut escaped = String::with_capacity(text.len() + 16);
+    for c in text.chars() {
+        match is_hidden(c) {
+            true => escaped.extend(c.escape_unicode()),
+            false => escaped.push(c),
+        }
+    }
+    escaped.into()
 }
 
 fn log_lost(reason: &str) {
@@ -71,10 +109,21 @@ fn log_lost(reason: &str) {
 
 /// Waits until all output is written, at most [`MAX_FLUSH`].
 pub(crate) fn flush() {
-    let (done, is_done) = sync_channel(1);
-    let is_written = WRITER.try_send(OutputChunk::Flush(done)).is_ok() && is_done.recv_timeout(MAX_FLUSH).is_ok();
-    if !is_written {
+    flush_for(MAX_FLUSH);
+}
+
+/// Waits until stdout is written, and meanwhile, but at most as given, for stderr.
+fn flush_for(max_stderr: Duration) {
+    let began = Instant::now();
+    let [out, err] = [&STDOUT, &STDERR].map(|stream| {
+        let (done, is_done) = sync_channel(1);
+        stream.try_send(OutputChunk::Flush(done)).ok().map(|()| is_done)
+    });
+    if out.is_none_or(|is_done| is_done.recv_timeout(MAX_FLUSH).is_err()) {
         LOST_OUTPUT.store(true, Ordering::Relaxed);
+    }
+    if let Some(is_done) = err {
+        let _ = is_done.recv_timeout(max_stderr.saturating_sub(began.elapsed())); // Otherwise, nobody reads the log.
     }
 }
 
@@ -150,7 +199,7 @@ impl TermLike for BarTerm {
     fn flush(&self) -> std::io::Result<()> {
         let buffered = std::mem::take(&mut *self.buffered.lock());
         if !buffered.is_empty() {
-            let _ = WRITER.try_send(OutputChunk::Err(buffered.into_bytes())); // A lost bar is drawn again later.
+            let _ = STDERR.try_send(OutputChunk::Bytes(buffered.into_bytes())); // A lost bar is drawn again later.
         }
         Ok(())
     }
@@ -158,31 +207,36 @@ impl TermLike for BarTerm {
 
 /// Prints one line of the result.
 pub(crate) fn line(text: impl Display) -> Result<(), StdoutError> {
-    flush();
+    flush_for(MAX_ORDERING);
+    let text = text.to_string();
     BARS.suspend(|| {
         let mut stdout = std::io::stdout().lock();
-        writeln!(stdout, "{text}").and_then(|()| stdout.flush()).map_err(StdoutError)
+        writeln!(stdout, "{}", printable(&text)).and_then(|()| stdout.flush()).map_err(StdoutError)
     })
 }
 
 /// Prints one line about a result in a file. If stdout fails or accepts no output, the line is lost, which is logged
 /// once.
 pub(crate) fn report(text: impl Display) {
-    let sent = BARS.suspend(|| WRITER.try_send(OutputChunk::Out(format!("{text}\n").into_bytes())));
-    if sent.is_err() {
+    report_styled(printable(&text.to_string()));
+}
+
+/// Prints text of this program as [`report`] does, with its colors.
+pub(crate) fn report_styled(text: impl Display) {
+    if !send(&STDOUT, format!("{text}\n")) {
         log_lost("it accepts no more output");
     }
 }
 
 /// Prints one line for the user to stderr. Unlike the log, it may contain a token.
 pub(crate) fn notice(text: impl Display) {
-    let _ = BARS.suspend(|| WRITER.try_send(OutputChunk::Err(format!("{text}\n").into_bytes())));
+    send(&STDERR, format!("{text}\n"));
 }
 
 /// Prints the error that ends the program to stderr. Like the log, it goes through the writer thread, so a terminal
 /// that accepts no output does not prevent the program from exiting with the right code.
 pub(crate) fn error(error: &anyhow::Error) {
-    let _ = BARS.suspend(|| WRITER.try_send(OutputChunk::Err(format!("error: {error:#}\n").into_bytes())));
+    send(&STDERR, format!("error: {}\n", printable(&format!("{error:#}"))));
 }
 
 /// Whether any line of [`report`] was lost.
@@ -245,11 +299,25 @@ struct LogTarget;
 
 impl Write for LogTarget {
     fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
-        let _ = BARS.suspend(|| WRITER.try_send(OutputChunk::Err(bytes.to_vec())));
+        send(&STDERR, printable(&String::from_utf8_lossy(bytes)).into_owned());
         Ok(bytes.len())
     }
 
     fn flush(&mut self) -> std::io::Result<()> {
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn control_characters_are_escaped() {
+        for plain in ["a\tb\nc", "Größe 5 µm → 3 Ω", ""] {
+            assert!(matches!(printable(plain), Cow::Borrowed(_)), "{plain}");
+        }
+        assert_eq!(printable("\x1b]0;title\x07\x1b[2J"), "\\u{1b}]0;title\\u{7}\\u{1b}[2J");
+        assert_eq!(printable("\u{9b}31m\u{7f}\r\u{202e}x"), "\\u{9b}31m\\u{7f}\\u{d}\\u{202e}x");
     }
 }

@@ -81,7 +81,7 @@ impl ServedPage {
     fn print_lines(&self) -> anyhow::Result<()> {
         self.lines().iter().for_each(print::report);
         if self.shared.is_some() && std::io::stdout().is_terminal() {
-            print::report(qr_code(&self.url())?);
+            print::report_styled(qr_code(&self.url())?);
         }
         Ok(())
     }

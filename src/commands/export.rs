@@ -4,7 +4,7 @@ use crate::exit::{self, BadArgument, Exit};
 use crate::open_gpu::open_gpu;
 use crate::{print, signals};
 use anyhow::{Context, ensure};
-use capture::config::Override;
+use capture::config::{Override, Rig};
 use capture::{Join, SampleUse, Stations, open};
 use clap::builder::{PossibleValue, PossibleValuesParser};
 use keyframe::{KeyframeList, counted, listed};
@@ -32,6 +32,9 @@ pub(crate) struct Args {
     /// Export exactly the keyframes that this `keyframes.txt` lists [default: the keyframes that a run would accept]
     #[arg(long, value_name = "FILE")]
     keyframes: Option<PathBuf>,
+    /// Use this rig file instead of the recording's
+    #[arg(long, value_name = "RIG.toml")]
+    rig: Option<PathBuf>,
 }
 
 /// The output format for recordings: a folder.
@@ -159,7 +162,9 @@ fn export_model(export: &Export, args: &Args) -> anyhow::Result<Exit> {
 }
 
 fn export_recording(args: &Args) -> anyhow::Result<Exit> {
-    let mut opened = open::recording(&args.from, None, &[Override::new("train.scale", 1.0)])?;
+    let overrides = [Override::new("train.scale", 1.0)];
+    let rig = args.rig.as_deref().map(|file| Rig::load(file, &overrides)).transpose()?;
+    let mut opened = open::recording(&args.from, rig, &overrides)?;
     let mut join = Join::new(&opened.rig)?;
     if let Some(list) = &args.keyframes {
         join = join.taking_only(KeyframeList::load(list)?);

@@ -168,6 +168,16 @@ pub enum NotDetected {
         /// Columns and rows of the target.
         expected: Counts,
     },
+    /// The markers are those of a board with other counts.
+    #[error("the markers form a board of {found} {what}, not {expected}; correct the counts of the target")]
+    OtherCounts {
+        /// Columns and rows of the board in the image; at least as many rows as the markers in it need.
+        found: Counts,
+        /// Columns and rows of the target.
+        expected: Counts,
+        /// What is counted.
+        what: &'static str,
+    },
     /// A part of the board is in the image and cannot be identified.
     #[error("only {found} of the {expected} inner corners found; move the camera until the whole board is in view")]
     Partial {

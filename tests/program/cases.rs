@@ -6,6 +6,9 @@ use serde_json::Value;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
+/// Split and stamp of an image, and its pose.
+type NamedPose = (String, Vec<f64>);
+
 /// A copy of a case, in which outputs may be written.
 struct Case {
     folder: tempfile::TempDir,
@@ -30,7 +33,7 @@ impl Case {
     }
 
     /// Trains for three steps; returns the exit code, what is printed, and the images with their poses by name.
-    fn train(&self, data: &str, out: &str) -> (Option<i32>, String, Vec<(String, Vec<f64>)>) {
+    fn train(&self, data: &str, out: &str) -> (Option<i32>, String, Vec<NamedPose>) {
         let (code, printed) = self.run(&["train", data, "--steps", "3", "--max-splats", "200", "--out", out]);
         let cameras = std::fs::read_to_string(self.at(out).join("cameras.json")).unwrap_or_else(|_| "{}".to_owned());
         let cameras: Value = serde_json::from_str(&cameras).unwrap();
@@ -242,4 +245,63 @@ fn huge_depth() {
     let (code, printed, cameras) = case.train(".", "r");
     assert_eq!((code, cameras.len()), (Some(3), 8), "{printed}");
     assert!(printed.contains("has 16384x16384 pixels, at most"), "{printed}");
+}
+
+#[test]
+fn attachments_at_the_end_of_a_recording() {
+    let Some(case) = Case::open("cases/mcap_attachments_last") else { return };
+    let (code, printed) = case.run(&["export", "last.mcap", "--to", "nerfstudio", "--out", "x"]);
+    assert!(code == Some(0) && printed.contains("photos"), "{printed}");
+    let transforms = std::fs::read_to_string(case.at("x/transforms.json")).unwrap();
+    let transforms: Value = serde_json::from_str(&transforms).unwrap();
+    assert!(transforms["frames"].as_array().unwrap().len() >= 15, "{printed}");
+}
+
+#[test]
+fn calibrations_of_ros() {
+    let Some(case) = Case::open("cases/ros_calibration_yaml") else { return };
+    let (code, printed) = case.run(&["calibrate", "hand-eye", "easy_handeye_samples.yaml"]);
+    assert!(code == Some(2) && printed.contains("this is YAML, expected JSON"), "{printed}");
+    // The case has no images: reading goes on beyond the intrinsics.
+    let (code, printed) = case.run(&["calibrate", "hand-eye", "samples_with_camera_info.json"]);
+    assert!(code == Some(2) && printed.contains("00.png") && !printed.contains("camera_matrix"), "{printed}");
+}
+
+#[test]
+fn sides_of_a_board_swapped() {
+    let Some(case) = Case::open("cases/charuco_sides_swapped") else { return };
+    let calibrate = |target: &str| case.run(&["calibrate", "intrinsics", "photos", "--target", target]);
+    let (code, printed) = calibrate("charuco:6x5:30mm:22mm:5X5_100");
+    assert_eq!(code, Some(4), "{printed}");
+    assert!(printed.contains("the markers form a board of 5x6 squares, not 6x5"), "{printed}");
+    let (code, printed) = calibrate("charuco:5x6:30mm:22mm:5X5_100");
+    assert_eq!(code, Some(0), "{printed}");
+}
+
+/// Joint states as ROS publishes them; the clock of the sender is that of this computer.
+#[cfg(feature = "sim")]
+#[test]
+fn joint_states_of_ros() {
+    use std::process::Stdio;
+    let Some(case) = Case::open("cases/udp_joint_states_of_ros") else { return };
+    let robots = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs/robots");
+    tree_copy(&robots, &case.at("robots"));
+    for (mode, other) in [("order", 0), ("extra", 0), ("nan", 0), ("nanvel", 0), ("emptyvel", 0), ("partial", 1)] {
+        let sender = Command::new("python3")
+            .args(["send.py", mode, "30"])
+            .current_dir(case.folder.path())
+            .stdout(Stdio::null())
+            .stderr(Stdio::null())
+            .spawn();
+        let Ok(mut sender) = sender else {
+            test_support::skip("python3 is not installed");
+            return;
+        };
+        let (_, printed) = case.run(&["doctor", "rig.toml", "--listen", "2"]);
+        sender.kill().unwrap();
+        sender.wait().unwrap();
+        assert!(!printed.contains("rejected a datagram") && !printed.contains("did not arrive"), "{mode}: {printed}");
+        assert!(printed.contains("joint states"), "{mode}: {printed}");
+        assert_eq!(printed.contains("ignored a datagram for another device"), other == 1, "{mode}: {printed}");
+    }
 }

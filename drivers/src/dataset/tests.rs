@@ -423,7 +423,8 @@ fn files_of_windows_programs_are_read() {
 #[test]
 fn every_readable_image_format_is_read_and_others_are_named() {
     let (folder, mut document) = small_folder();
-    let photo = RgbImage::from_fn(8, 6, |x, y| image::Rgb([10 * x as u8, 20 * y as u8, 30]));
+    let photo =
+        RgbImage::from_fn(8, 6, |x, y| image::Rgb([if x < 4 { 10 } else { 200 }, if y < 3 { 20 } else { 99 }, 30]));
     for extension in ["png", "webp", "bmp", "tiff"] {
         let name = format!("photo.{extension}");
         photo.save(folder.path().join(&name)).unwrap();

@@ -105,7 +105,7 @@ impl<'a> Element<'a> {
     }
 
     /// The only child with this tag. Repetitions are accepted if they have the same attributes.
-    pub(crate) fn only(self, tag: &'static str) -> Result<Option<Element<'a>>, Problem> {
+    pub(crate) fn only(self, tag: &'static str) -> Result<Option<Self>, Problem> {
         let mut all = self.all(tag);
         let Some(first) = all.next() else { return Ok(None) };
         let attributes = |element: Element<'a>| element.0.attributes().map(|a| (a.name(), a.value()));

@@ -8,6 +8,7 @@ mod json_object;
 mod lens;
 mod outputs;
 mod page;
+mod ros;
 mod scan;
 mod scene;
 mod target;

@@ -1,7 +1,7 @@
 //! Reasons why markers of a target were not found.
 
 use crate::dictionary::Dictionary;
-use crate::error::{Ids, NotDetected};
+use crate::error::{Counts, Ids, NotDetected};
 use crate::gray::Plane;
 use crate::homography::Homography;
 use crate::lattice::distance;
@@ -46,6 +46,42 @@ pub(super) fn marker_size(target: &TargetSpec, markers: &[Marker], min_change: f
         expected_frac,
         square: Millimeters(square_m).to_string(),
         marker: format!("{:.0}mm", 1e3 * found_frac * square_m),
+    })
+}
+
+/// The counts of the board that the markers form, if they fit other counts better than those of the target.
+///
+/// * `n_confirmed`: number of markers that fit those of the target.
+pub(super) fn other_counts(target: &TargetSpec, markers: &[Marker], n_confirmed: usize) -> Option<NotDetected> {
+    const MAX_COLUMNS: u32 = 40;
+    const MIN_CONFIRMED: usize = 4;
+    let (expected, what) = match target.pattern {
+        Pattern::Charuco { squares, .. } => (squares, "squares"),
+        Pattern::Aprilgrid { tags, .. } => (tags, "tags"),
+        _ => return None,
+    };
+    let n_ids = markers.iter().map(|marker| marker.id + 1).max()?;
+    let with = |counts: [u32; 2]| match target.pattern.clone() {
+        Pattern::Charuco { square_m, marker_m, dictionary, .. } => {
+            Pattern::Charuco { squares: counts, square_m, marker_m, dictionary }
+        }
+        Pattern::Aprilgrid { tag_m, spacing_frac, .. } => Pattern::Aprilgrid { tags: counts, tag_m, spacing_frac },
+        other => other,
+    };
+    // The number of columns alone determines where a marker is.
+    let counts = (2..=MAX_COLUMNS).filter(|columns| *columns != expected[0]).map(|columns| {
+        let per_marker = if what == "squares" { 2 } else { 1 };
+        let needed = (per_marker * n_ids).div_ceil(columns).max(2);
+        let is_swapped = columns == expected[1] && needed <= expected[0];
+        [columns, if is_swapped { expected[0] } else { needed }]
+    });
+    let fits = counts.filter_map(|counts| Some((counts, layout::fit(layouts(&with(counts)), markers)?.n_confirmed)));
+    let (found, n_found) = fits.max_by_key(|(counts, n)| (*n, *counts == [expected[1], expected[0]]))?;
+    let of = |[columns, rows]: [u32; 2]| Counts { columns, rows };
+    (n_found >= MIN_CONFIRMED && n_found > 2 * n_confirmed).then(|| NotDetected::OtherCounts {
+        found: of(found),
+        expected: of(expected),
+        what,
     })
 }
 
@@ -97,7 +133,8 @@ pub(super) fn markers(
         return if 2 * n_expected < found.0.len() {
             NotDetected::OtherIds { found, expected: Ids(expected.collect()) }
         } else {
-            marker_size(target, markers, MIN_SIZE_CHANGE).unwrap_or(NotDetected::OtherArrangement { found })
+            let reason = other_counts(target, markers, 0).or_else(|| marker_size(target, markers, MIN_SIZE_CHANGE));
+            reason.unwrap_or(NotDetected::OtherArrangement { found })
         };
     }
     // Number of markers, without those that may be chance.

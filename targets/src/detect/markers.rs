@@ -40,7 +40,9 @@ pub(super) fn detect(target: &TargetSpec, plane: &Plane) -> Result<Detection, No
     };
     if pixels.len() < MIN_CORNERS {
         let too_few = NotDetected::TooFewCorners { found: pixels.len(), min: MIN_CORNERS };
-        return Err(diagnosis::marker_size(target, &markers, diagnosis::MIN_SIZE_CHANGE).unwrap_or(too_few));
+        let reason = diagnosis::other_counts(target, &markers, fit.n_confirmed)
+            .or_else(|| diagnosis::marker_size(target, &markers, diagnosis::MIN_SIZE_CHANGE));
+        return Err(reason.unwrap_or(too_few));
     }
     // The corners do not depend on the markers, but if their size is wrong, that of the squares may be wrong, too.
     match diagnosis::marker_size(target, &fit.markers, MAX_SIZE_CHANGE) {

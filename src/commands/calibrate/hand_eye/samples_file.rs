@@ -3,7 +3,7 @@
 use super::super::images::{self, DetectedImage, ImageFile, OtherSize};
 use super::super::json_object::JsonObject;
 use super::super::lens::LensFile;
-use super::super::{outputs, target_argument};
+use super::super::{outputs, ros, target_argument};
 use crate::exit::{BadArgument, InsufficientData};
 use calibration::hand_eye::{BoardObservation, HandEyeSample, Setup};
 use kinematics::{Intrinsics, Transform};
@@ -55,8 +55,11 @@ impl SamplesFile {
     pub(super) fn read(path: &Path) -> Result<Self, BadArgument> {
         let name = path.display().to_string();
         let text = outputs::read_text(path)?;
-        let value: Value = serde_json::from_str(&text)
+        let mut value: Value = serde_json::from_str(&text)
             .map_err(|error| BadArgument(format!("{name}: {error}{}", not_json_hint(&text))))?;
+        if let Some(intrinsics) = value.get_mut("intrinsics") {
+            ros::convert(intrinsics).map_err(|error| BadArgument(format!("{name}: intrinsics: {error}")))?;
+        }
         let file = JsonObject::new(&name, String::new(), &value, &FILE_KEYS)?;
         let intrinsics = file.object("intrinsics", &LensFile::KEYS)?;
         let target = file.text("target")?.map(target_argument).transpose();
@@ -168,6 +171,9 @@ fn not_json_hint(text: &str) -> &'static str {
     let has = |word: &str| text.split(|c: char| !c.is_ascii_alphabetic()).any(|found| found == word);
     if ["NaN", "nan", "Infinity", "inf"].into_iter().any(has) {
         "; NaN and infinity are not JSON: remove the samples that contain them"
+    } else if ros::is_yaml(text) {
+        "; this is YAML, expected JSON with the keys of docs/guide/calibration.md. To convert YAML: python3 -c \"import json, sys, yaml; \
+         json.dump(yaml.safe_load(sys.stdin), sys.stdout)\" < FILE.yaml > FILE.json"
     } else {
         ""
     }
