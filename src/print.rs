@@ -6,7 +6,7 @@
 //! writes the lines, so that a terminal or a program that accepts no output blocks neither this program nor the other
 //! stream. [`has_lost_output`] returns whether any lines of stdout were lost.
 //!
-//! Text may come from files and other programs, so control characters, which terminals may obey, are escaped in it.
+//! Text may come from files and other programs, so control characters, which a terminal may interpret, are escaped in it.
 
 use anyhow::Context;
 use console::Term;
@@ -47,7 +47,7 @@ enum OutputChunk {
     Flush(SyncSender<()>),
 }
 
-/// Send output to the threads that write it.
+/// Queue of the thread that writes to stdout.
 static STDOUT: LazyLock<SyncSender<OutputChunk>> = LazyLock::new(|| {
     writer(|bytes| {
         let mut stdout = std::io::stdout().lock();
@@ -56,12 +56,13 @@ static STDOUT: LazyLock<SyncSender<OutputChunk>> = LazyLock::new(|| {
         }
     })
 });
+/// Queue of the thread that writes to stderr.
 static STDERR: LazyLock<SyncSender<OutputChunk>> = LazyLock::new(|| {
     // The output is lost if the terminal is closed or the disk is full.
     writer(|bytes| drop(std::io::stderr().write_all(bytes)))
 });
 
-/// Starts a thread that writes. If it cannot be started, the output is lost.
+/// Starts the thread that calls `write` for each chunk. If it cannot be started, the output is lost.
 fn writer(write: fn(&[u8])) -> SyncSender<OutputChunk> {
     let (sender, chunks) = sync_channel(MAX_WAITING);
     let write_all = move || {
@@ -78,7 +79,7 @@ fn writer(write: fn(&[u8])) -> SyncSender<OutputChunk> {
     sender
 }
 
-/// Sends text to a stream; returns whether it has room. The progress bars are hidden meanwhile.
+/// Queues text for a stream; returns false if the queue is full. The progress bars are hidden meanwhile.
 fn send(stream: &SyncSender<OutputChunk>, text: String) -> bool {
     BARS.suspend(|| stream.try_send(OutputChunk::Bytes(text.into_bytes())).is_ok())
 }
@@ -112,7 +113,7 @@ pub(crate) fn flush() {
     flush_for(MAX_FLUSH);
 }
 
-/// Waits until stdout is written, and meanwhile, but at most as given, for stderr.
+/// Waits until stdout is written, at most [`MAX_FLUSH`], and until stderr is written, at most `max_stderr` from the call.
 fn flush_for(max_stderr: Duration) {
     let began = Instant::now();
     let [out, err] = [&STDOUT, &STDERR].map(|stream| {
@@ -123,7 +124,7 @@ fn flush_for(max_stderr: Duration) {
         LOST_OUTPUT.store(true, Ordering::Relaxed);
     }
     if let Some(is_done) = err {
-        let _ = is_done.recv_timeout(max_stderr.saturating_sub(began.elapsed())); // Otherwise, nobody reads the log.
+        let _ = is_done.recv_timeout(max_stderr.saturating_sub(began.elapsed())); // After a timeout, stderr accepts no output.
     }
 }
 

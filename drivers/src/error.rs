@@ -336,7 +336,7 @@ pub enum Error {
         format: &'static str,
     },
     /// An image of a dataset is too large for the memory of most computers.
-    #[error("{path:?} has {}x{} pixels, at most {max_px} are read", .got_px[0], .got_px[1])]
+    #[error("{path:?} has {}x{} pixels, which exceeds the maximum of {max_px}; scale the image down", .got_px[0], .got_px[1])]
     TooManyPixels {
         /// The file.
         path: PathBuf,

@@ -147,7 +147,7 @@ impl Unfinished {
                     let flags = OFlags::RDONLY | OFlags::NOFOLLOW | OFlags::NONBLOCK | OFlags::CLOEXEC;
                     match rustix::fs::open(&unfinished, flags, Mode::empty()).map(File::from) {
                         Ok(leftover) if !try_lock(&leftover)? => return Err(busy()),
-                        // The lock is held while the leftover is removed, so that no other program removes a successor.
+                        // Holding the lock keeps other programs from removing a new file at this path in the meantime.
                         Ok(leftover) if is_at(&leftover, &unfinished) => remove_leftover(&unfinished, path)?,
                         // Its program has just published or removed it.
                         Ok(_) | Err(rustix::io::Errno::NOENT) => {}
@@ -162,7 +162,7 @@ impl Unfinished {
     }
 }
 
-/// Removes what has a temporary name. A folder is removed only if it contains nothing but the file that was to be written.
+/// Removes a temporary file or folder that a killed program left behind. A folder is removed only if it contains nothing but the file that was to be written.
 fn remove_leftover(unfinished: &Path, path: &Path) -> std::io::Result<()> {
     let inside = unfinished.join(path.file_name().unwrap_or_default());
     let own = [partial::path_of(&inside), inside];

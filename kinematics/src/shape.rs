@@ -160,7 +160,11 @@ fn shape(element: Element<'_>, notes: &mut Notes) -> Result<Shape, Problem> {
         "cylinder" | "capsule" => &["radius", "length"],
         "sphere" => &["radius"],
         "mesh" => &["filename", "scale"],
-        other => return Err(form.problem(format!("there is no geometry <{other}>"))),
+        other => {
+            return Err(
+                form.problem(format!("unknown geometry <{other}>, expected box, cylinder, capsule, sphere or mesh"))
+            );
+        }
     };
     form.note_unknown(attributes, &[], notes);
     Ok(Shape { link_from_shape: origin(element)?, geometry: read_geometry(form)?, color_srgba: None })
@@ -240,7 +244,7 @@ mod tests {
             (r#"<origin xyz="nan 0 0"/><geometry><sphere radius="1"/></geometry>"#, "origin"),
             (r#"<geometry><mesh filename="a.stl" scale="1 inf 1"/></geometry>"#, "scale"),
             (r#"<geometry><mesh/></geometry>"#, r#"<mesh> has no attribute "filename""#),
-            (r#"<geometry><cone radius="1"/></geometry>"#, "there is no geometry <cone>"),
+            (r#"<geometry><cone radius="1"/></geometry>"#, "unknown geometry <cone>"),
             (r#"<geometry/>"#, "<geometry> has 0 children"),
             (r#"<origin xyz="0 0 0"/>"#, "it has no <geometry>"),
         ] {

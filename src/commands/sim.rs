@@ -29,8 +29,8 @@ pub(crate) struct Args {
     /// Version of FCI that the emulated Franka controller uses: 5 (Panda) or 10 (FR3)
     #[arg(long, value_name = "VERSION", default_value = "10", value_parser = ["5", "10"])]
     fci: String,
-    /// How long the emulated Franka controller waits for each answer during a motion, milliseconds. A real one does not
-    /// wait; with 15, a busy computer does not stop the motion
+    /// Time for which the emulated Franka controller waits for each command during a motion, milliseconds. A real one
+    /// does not wait; with 15, a busy computer rarely causes a reflex
     #[arg(long, value_name = "MS", default_value_t = 0.0, value_parser = number_in_range(0.0..=1000.0))]
     answer_wait: f64,
     /// Print JSON, one object per line

@@ -169,9 +169,9 @@ pub enum NotDetected {
         expected: Counts,
     },
     /// The markers are those of a board with other counts.
-    #[error("the markers form a board of {found} {what}, not {expected}; correct the counts of the target")]
+    #[error("the markers form a board of {found} {what} (or more rows), not {expected}; correct --target")]
     OtherCounts {
-        /// Columns and rows of the board in the image; at least as many rows as the markers in it need.
+        /// Columns of the board in the image, and the fewest rows that contain all its marker ids.
         found: Counts,
         /// Columns and rows of the target.
         expected: Counts,

@@ -108,7 +108,7 @@ pub(super) fn resolve_joints(file: &str, arm: &mut Arm) -> Result<(), ConfigErro
     let robot = |key, e: kinematics::Error| ConfigError::Robot { file: file.to_owned(), key, reason: e.to_string() };
     let description = kinematics::urdf::Robot::parse(&arm.urdf_text).map_err(|e| robot("arm.urdf", e))?;
     for note in description.notes() {
-        log::warn!("{file}: arm.urdf: {note}");
+        log::warn!("the URDF of {file}, {note}");
     }
     if arm.base_link.is_empty() {
         arm.base_link = description.root().map_err(|e| robot("arm.urdf", e))?.to_owned();

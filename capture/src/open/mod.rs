@@ -198,7 +198,7 @@ fn stored_rig(path: &Path, recording: &Recording, overrides: &[Override]) -> cra
     let text = |name| {
         let bytes = recording.attachment(name).with_context(|| {
             format!(
-                "the recording {path:?} contains no {name}; if another program removed it, name the rig file with --rig"
+                "the recording {path:?} contains no {name}, which fieldrig stores in it; if another program removed it, give the rig file with --rig"
             )
         })?;
         std::str::from_utf8(bytes).with_context(|| format!("the recording {path:?}: {name} is not text"))

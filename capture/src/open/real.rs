@@ -99,7 +99,7 @@ pub(super) fn motion_limits(rig: &Rig, acceleration_secs: f64, jerk_secs: f64) -
             joint_ix.map(|joint_ix| chain.limits()[joint_ix]).context("a joint of the rig is not in its URDF")?;
         if !joint.is_range_valid {
             bail!(
-                "arm.motion: the URDF states no valid range for joint {name:?}; correct its <limit>, as the joint is not moved without one"
+                "arm.motion: the <limit> of joint {name:?} in the URDF is invalid; give finite numbers, lower at most upper"
             );
         }
         let mut joint = MotionLimits::new(&joint, arm.max_speed_rad_s, acceleration_secs, jerk_secs);

@@ -151,14 +151,28 @@ pub fn read(path: &Path) -> Result<Dataset, Error> {
     let names: BTreeSet<String> = document.frames.iter().map(|entry| normalized(&entry.file_path)).collect();
     let absent: Vec<String> = splits.keys().filter(|name| !names.contains(*name)).cloned().collect();
     for (names, what) in [
-        (unlisted, "not in any of the lists train_filenames, val_filenames and test_filenames, and not used"),
-        (absent, "in these lists, but has no frame"),
-        (rounded, "at poses with rounded numbers; the nearest rotation is used, which may be wrong by 0.1 degrees"),
+        (&unlisted, "not used, because train_filenames, val_filenames and test_filenames do not contain them"),
+        (&absent, "only in train_filenames, val_filenames or test_filenames, but not in frames"),
     ] {
         if !names.is_empty() {
             let (images, verb) = plural(names.len(), "image");
-            notes.push(format!("{images} {verb} {what}: {}", first_names(&names)));
+            notes.push(format!("{images} {verb} {what}: {}", first_names(names)));
         }
+    }
+    if !rounded.is_empty() {
+        let (images, _) = plural(rounded.len(), "image");
+        notes.push(format!(
+            "the rotations of {images} are rounded to about three decimals, so the poses may be off by 0.1 degrees; write at \
+             least four decimals: {}",
+            first_names(&rounded)
+        ));
+    }
+    if images.is_empty() && !unlisted.is_empty() {
+        return Err(file_error(format!(
+            "train_filenames, val_filenames and test_filenames contain no image of frames: they name {}, frames {}",
+            first_names(&absent),
+            first_names(&unlisted)
+        )));
     }
     let n_missing_depth = document.frames.iter().filter(|entry| entry.lacks_depth(&folder)).count();
     if n_missing_depth > 0 {
@@ -320,8 +334,12 @@ fn rows_of(matrix: &Matrix) -> Result<[f64; 16], String> {
 
 /// Converts an OpenGL camera pose to our convention. Also returns whether its numbers are rounded.
 fn world_from_camera(rows: &[f64; 16]) -> Result<(Transform, bool), String> {
-    let (world_from_opengl, is_rounded) = transform::from_rounded_rows(rows)
-        .map_err(|error| format!("{error}; if the numbers were rounded, write at least four decimals"))?;
+    let (world_from_opengl, is_rounded) = transform::from_rounded_rows(rows).map_err(|error| match error {
+        kinematics::Error::NotRigid { .. } => {
+            format!("{error}; if the numbers were rounded, write at least four decimals")
+        }
+        error => error.to_string(),
+    })?;
     Ok((world_from_opengl * opengl_from_camera(), is_rounded))
 }
 

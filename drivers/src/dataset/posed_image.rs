@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 
 /// Maximum size of an image file.
 const MAX_IMAGE_BYTES: u64 = 1 << 30;
-/// Maximum number of pixels of a photo: 134 million. A small file can contain many more, if they are equal.
+/// Maximum number of pixels of a photo: 134 million. A small file of a uniform image can contain many more.
 const MAX_COLOR_PX: u64 = 1 << 27;
 /// Maximum number of pixels of a depth image: 34 million.
 const MAX_DEPTH_PX: u64 = 1 << 25;
@@ -41,9 +41,9 @@ pub struct DatasetImage {
 pub enum ListedSplit {
     /// For training.
     Train,
-    /// For decisions during training.
+    /// Decides hyperparameters; not reported.
     Validation,
-    /// For scores only.
+    /// Gives the reported scores.
     Test,
 }
 
@@ -68,7 +68,7 @@ pub struct LoadedImage {
     pub depth: Option<DepthImage>,
     /// Reason why depth is missing although the image has a depth file.
     pub depth_error: Option<String>,
-    /// Why the mask probably excludes other pixels than it was meant to.
+    /// Reason why the mask probably excludes the wrong pixels.
     pub mask_warning: Option<String>,
 }
 
@@ -94,7 +94,7 @@ impl DatasetImage {
             let mask = decode_file(mask_path, MAX_COLOR_PX)?;
             if is_in_alpha(&mask) {
                 mask_warning = Some(format!(
-                    "{mask_path:?} is black everywhere, and only its alpha channel differs; write masks as gray images"
+                    "{mask_path:?} is all black and stores its content in the alpha channel; save it as a gray image"
                 ));
             }
             let mask = mask.into_luma8();

@@ -294,7 +294,12 @@ fn tum_photos_interpolate_pose_and_use_nearest_depth() {
     let folder = tum_folder();
     let dataset = read(folder.path()).unwrap();
     assert_eq!((dataset.images.len(), dataset.n_missing, dataset.n_unusable), (3, 1, 1));
-    assert!(dataset.notes.iter().any(|note| note.contains("rgb/9.000000.png (its time is outside the poses)")));
+    assert!(
+        dataset
+            .notes
+            .iter()
+            .any(|note| note.contains("rgb/9.000000.png (its time is before the first or after the last pose)"))
+    );
     assert!(dataset.notes.contains(&"1 photo has no depth image within 20 ms".to_owned()), "{:?}", dataset.notes);
     let second = &dataset.images[1];
     assert_eq!(second.stamp, Stamp(1_100_000_000));
@@ -362,14 +367,20 @@ fn listed_splits_are_kept_and_unlisted_images_left_out() {
     write_transforms(&folder, &document);
     assert_eq!(listed(), [validation, test]);
     let notes = read(folder.path()).unwrap().notes;
-    assert_eq!(notes, ["1 image is in these lists, but has no frame: gone.png"]);
+    assert_eq!(
+        notes,
+        ["1 image is only in train_filenames, val_filenames or test_filenames, but not in frames: gone.png"]
+    );
     document["val_filenames"] = json!([]);
     document["train_filenames"] = json!(["b.png"]);
     document["test_filenames"] = json!([]);
     write_transforms(&folder, &document);
     assert_eq!(listed(), [train]);
     let notes = read(folder.path()).unwrap().notes;
-    assert!(notes[0].starts_with("1 image is not in any of the lists") && notes[0].ends_with(": a.png"), "{notes:?}");
+    assert!(
+        notes[0].starts_with("1 image is not used, because train_filenames") && notes[0].ends_with(": a.png"),
+        "{notes:?}"
+    );
     document["test_filenames"] = json!(["b.png"]);
     write_transforms(&folder, &document);
     assert!(read_error(&folder).ends_with(r#""b.png" is in both train_filenames and test_filenames"#));
@@ -460,7 +471,7 @@ fn huge_depth_of_a_small_file_is_refused() {
     let loaded = dataset.images[1].load().unwrap();
     assert!(loaded.depth.is_none());
     let why = loaded.depth_error.unwrap();
-    assert!(why.contains("has 8192x4097 pixels, at most 33554432 are read"), "{why}");
+    assert!(why.contains("has 8192x4097 pixels, which exceeds the maximum of 33554432"), "{why}");
 }
 
 #[test]
@@ -472,7 +483,7 @@ fn mask_in_the_alpha_channel_is_named() {
     write_transforms(&folder, &document);
     let loaded = read(folder.path()).unwrap().images[0].load().unwrap();
     assert!(
-        loaded.mask_warning.unwrap().contains("mask.png\" is black everywhere, and only its alpha channel differs")
+        loaded.mask_warning.unwrap().contains("mask.png\" is all black and stores its content in the alpha channel")
     );
 }
 
@@ -602,7 +613,7 @@ fn invalid_lines_and_repeated_times_of_tum_lists_are_named() {
         "rgb.txt: 1 line cannot be used: line 2: nothing follows the time",
         "groundtruth.txt: 2 lines cannot be used: line 2: expected seven numbers tx ty tz qx qy qz qw after the time, \
          line 5: expected seven numbers tx ty tz qx qy qz qw after the time",
-        "groundtruth.txt: 1 pose is not used, because another pose has the same time (are the times rounded?): line 4",
+        "groundtruth.txt: 1 pose is not used, because an earlier, different pose has the same time; write times with more decimals: line 4",
     ];
     assert_eq!(dataset.data_losses, expected);
 }

@@ -19,7 +19,7 @@ const POSE_LIST: &str = "groundtruth.txt";
 const CAMERA_FILE: &str = "calibration.txt";
 /// Maximum time between an image and its depth image or pose.
 const MAX_GAP_NANOS: i64 = 20_000_000;
-/// Maximum time between two poses that are interpolated, if poses are usually that far apart.
+/// Upper limit of the time between two poses that are interpolated, whatever their median interval.
 const MAX_POSE_INTERVAL_NANOS: i64 = 110_000_000;
 /// Poses are not interpolated over a gap of more than this number of usual intervals.
 const MAX_USUAL_INTERVALS: f64 = 1.5;
@@ -230,7 +230,7 @@ impl Poses {
         if !repeated.is_empty() {
             let (what, verb) = plural(repeated.len(), "pose");
             skipped.lost.push(format!(
-                "{POSE_LIST}: {what} {verb} not used, because another pose has the same time (are the times rounded?): {}",
+                "{POSE_LIST}: {what} {verb} not used, because an earlier, different pose has the same time; write times with more decimals: {}",
                 first_names(&repeated)
             ));
         }
@@ -247,11 +247,10 @@ impl Poses {
             return Ok(*pose);
         }
         let (Some(after), Some(before)) = (after, after_ix.checked_sub(1).map(|ix| &self.poses[ix])) else {
-            return Err("its time is outside the poses".to_owned());
+            return Err("its time is before the first or after the last pose".to_owned());
         };
         let interval_nanos = after.0.nanos_since(before.0);
-        let is_near = [stamp.nanos_since(before.0), after.0.nanos_since(stamp)].iter().all(|gap| *gap <= MAX_GAP_NANOS);
-        if !is_near && interval_nanos > self.max_interval_nanos {
+        if interval_nanos > self.max_interval_nanos {
             let [interval_millis, max_millis] =
                 [interval_nanos, self.max_interval_nanos].map(|nanos| nanos / 1_000_000);
             return Err(format!(

@@ -14,7 +14,7 @@ pub struct DatagramCounts {
     pub n_rejected: u64,
     /// Number of missing sequence numbers and missing parts of scans.
     pub n_lost: u64,
-    /// Number of datagrams for another device, such as states of joints that do not belong to the arm.
+    /// Number of joint states that name none of the arm's joints.
     pub n_other: u64,
     /// Number of datagrams from senders other than the current one.
     pub n_foreign: u64,
@@ -96,7 +96,7 @@ impl DatagramCounts {
         let problems = [n_rejected, n_lost, n_foreign, n_late, n_dropped, n_uncertain, n_restarts, n_clock_restarts];
         if problems.iter().any(|n| **n > 0) {
             log::warn!(
-                "{device}: {n_received} datagrams: {n_rejected} rejected, {n_foreign} from another sender, {n_other} for another device, {n_late} late or duplicate, {n_dropped} dropped because \
+                "{device}: {n_received} datagrams: {n_rejected} rejected, {n_foreign} from another sender, {n_other} without any joint of the arm, {n_late} late or duplicate, {n_dropped} dropped because \
                  the program was too slow, {n_uncertain} too uncertain; {n_lost} scans, poses or parts did not arrive; \
                  the sender's sequence numbers restarted {n_restarts} times, its clock {n_clock_restarts} times"
             );

@@ -40,7 +40,7 @@ impl DatagramReader {
     }
 
     /// Returns the next value that `decode` accepts with its stamp on our clock, or `None` if none came in time. A datagram
-    /// without a value, which is for another device, only counts in the sequence.
+    /// without a value, such as the state of a gripper, only counts in the sequence.
     pub(super) fn next<T>(
         &mut self,
         timeout: Duration,
@@ -95,7 +95,8 @@ impl DatagramReader {
             }
         }
         let Some(reading) = reading else {
-            let what = format_args!("ignored a datagram for another device");
+            let what =
+                "ignored a state that names none of the arm's joints; if these are its joints, correct arm.joints";
             count_and_warn(device, &mut counts.n_other, 1, what);
             return None;
         };

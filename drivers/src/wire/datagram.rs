@@ -335,7 +335,8 @@ pub fn decode_joints(bytes: &[u8], names: &[String]) -> Result<(DatagramHeader, 
             return Ok(Vec::new());
         }
         if numbers.len() != n {
-            return Err(invalid(format!("{what} has {} numbers, expected {n}, one per joint", numbers.len())));
+            let per = if reported.is_some() { "name" } else { "joint" };
+            return Err(invalid(format!("{what} has {} numbers, expected {n}, one per {per}", numbers.len())));
         }
         let ordered: Option<Vec<f64>> = order.iter().map(|ix: &usize| numbers[*ix]).collect();
         match ordered {

@@ -15,7 +15,7 @@ const MAX_NOTES: usize = 100;
 pub(super) fn parse(xml: &str) -> Result<Document<'_>, Error> {
     let syntax = |why: String| Error::UrdfSyntax { why };
     let limited = |what: &str, n: usize, max: usize| match n > max {
-        true => Err(syntax(format!("it has {n} {what}, at most {max} are read"))),
+        true => Err(syntax(format!("its {n} {what} exceed the maximum of {max}"))),
         false => Ok(()),
     };
     limited("bytes", xml.len(), MAX_BYTES)?;
@@ -37,7 +37,7 @@ pub(crate) struct Problem {
     pub(crate) why: String,
 }
 
-/// What was left out, in the order in which it was found.
+/// Notes about elements that are not used: problems in file order, then unknown names, sorted.
 #[derive(Debug, Default)]
 pub(crate) struct Notes {
     texts: Vec<String>,
@@ -57,11 +57,11 @@ impl Notes {
     pub(crate) fn into_texts(self) -> Vec<String> {
         let Self { mut texts, n_omitted, unknown } = self;
         if n_omitted > 0 {
-            texts.push(format!("{n_omitted} more such elements"));
+            texts.push(format!("{n_omitted} more notes are not shown"));
         }
         let n_kinds = unknown.len();
         for ((parent, what), (line, n)) in unknown.into_iter().take(MAX_NOTES) {
-            let others = if n > 1 { format!(" and {} more times", n - 1) } else { String::new() };
+            let others = if n > 1 { format!(" (and {} more)", n - 1) } else { String::new() };
             texts.push(format!("line {line}{others}: {what} in <{parent}> is not used"));
         }
         if n_kinds > MAX_NOTES {
@@ -167,7 +167,7 @@ impl<'a> Element<'a> {
                     add(format!("<{}>", tag.name()), child.range().start);
                 }
             } else if tag.namespace().is_some_and(|namespace| namespace.contains("xacro")) {
-                add(format!("<xacro:{}>, which xacro was to expand,", tag.name()), child.range().start);
+                add(format!("<xacro:{}>, which xacro has not expanded,", tag.name()), child.range().start);
             }
         }
     }

@@ -9,12 +9,13 @@ const ATTRIBUTES: [&str; 2] = ["name", "type"];
 /// The last three do not affect kinematics.
 const CHILDREN: [&str; 9] =
     ["parent", "child", "origin", "axis", "limit", "mimic", "dynamics", "calibration", "hardwareInterface"];
-/// The last three limit a derivative that this project does not use.
+/// The last three are not used.
 const LIMIT_ATTRIBUTES: [&str; 7] = ["lower", "upper", "velocity", "effort", "acceleration", "deceleration", "jerk"];
 /// Shortest quaternion that is normalized instead of refused.
 const MIN_QUATERNION_NORM: f64 = 1e-6;
 
-/// Reads a joint. If a number is invalid that only matters to chains with this joint, the joint keeps the error.
+/// Reads a joint. An invalid pose, axis, type or mimic rule is stored in [`Joint::problem`], because only chains through this
+/// joint need it.
 ///
 /// # Errors
 /// If its name or its links are missing.
@@ -88,7 +89,9 @@ impl Motion {
             "floating" => JointKind::Unsupported("floating"),
             "planar" => JointKind::Unsupported("planar"),
             "spherical" => JointKind::Unsupported("spherical"),
-            other => return Err(element.problem(format!("its type is {other:?}, which does not exist"))),
+            other => return Err(element.problem(format!(
+                "unknown type {other:?}, expected fixed, revolute, continuous, prismatic, floating, planar or spherical"
+            ))),
         };
         let parent_from_joint = origin(element)?;
         let is_movable = matches!(kind, JointKind::Revolute | JointKind::Prismatic);
@@ -114,7 +117,7 @@ pub(crate) fn origin(element: Element<'_>) -> Result<Transform, Problem> {
     let Some(origin) = element.only("origin")? else { return Ok(Transform::identity()) };
     let xyz = origin.numbers("xyz")?.unwrap_or([0.0; 3]);
     let rotation = match (origin.numbers("rpy")?, origin.numbers("quat_xyzw")?) {
-        (Some(_), Some(_)) => return Err(origin.problem("<origin> has a rotation as rpy and one as quat_xyzw")),
+        (Some(_), Some(_)) => return Err(origin.problem("<origin> has both rpy and quat_xyzw; remove one")),
         // Roll, pitch and yaw rotate about the parent's fixed axes x, y, z in both URDF and nalgebra.
         (rpy, None) => {
             let [roll, pitch, yaw] = rpy.unwrap_or([0.0; 3]);
@@ -129,7 +132,8 @@ pub(crate) fn origin(element: Element<'_>) -> Result<Transform, Problem> {
 fn axis(joint: Element<'_>) -> Result<Unit<Vector3<f64>>, Problem> {
     let Some(axis) = joint.only("axis")? else { return Ok(Vector3::x_axis()) };
     let Some(xyz) = axis.numbers("xyz")? else { return Ok(Vector3::x_axis()) };
-    Unit::try_new(Vector3::from(xyz), f64::MIN_POSITIVE).ok_or_else(|| axis.problem("its axis is zero"))
+    Unit::try_new(Vector3::from(xyz), f64::MIN_POSITIVE)
+        .ok_or_else(|| axis.problem("xyz of <axis> is zero, expected a direction"))
 }
 
 fn mimic(joint: Element<'_>) -> Result<Option<Mimic>, Problem> {
@@ -160,7 +164,7 @@ fn read_limits(limit: Element<'_>, is_continuous: bool, what: &str, notes: &mut 
         return JointLimits { lower, upper, ..unlimited };
     }
     if !(lower.is_nan() || upper.is_nan()) {
-        notes.add(limit.line(), &format!("{what}: its range is {lower} to {upper}"));
+        notes.add(limit.line(), &format!("{what}: lower of <limit> is {lower}, above upper, which is {upper}; the joint has no range and is not moved"));
     }
     JointLimits { is_range_valid: false, ..unlimited }
 }

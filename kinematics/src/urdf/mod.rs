@@ -15,7 +15,7 @@ use std::collections::{HashMap, HashSet};
 pub const MAX_BYTES: usize = 16 << 20;
 
 /// Links and joints of one robot. The links of every joint exist, no link has two parents, there is no cycle, and all
-/// numbers of valid joints are finite.
+/// numbers of valid joints except limits are finite.
 #[derive(Clone, Debug)]
 pub struct Robot {
     name: String,
@@ -108,7 +108,8 @@ impl Robot {
     /// [`Robot::notes`].
     ///
     /// # Errors
-    /// If it is not the XML of a robot, is larger than [`MAX_BYTES`], or its links and joints do not form a tree.
+    /// If it is not the XML of a robot, is larger than [`MAX_BYTES`], a link or joint has no name, a joint lacks a link, a
+    /// link has two parents, or joints form a cycle.
     pub fn parse(xml: &str) -> Result<Self, Error> {
         let document = element::parse(xml)?;
         let root = Element::root(&document);
@@ -347,20 +348,28 @@ mod tests {
                 r#""0 0 ${h}", expected 3 numbers with spaces between them (expand"#,
             ),
             ("fixed", r#"<origin xyz="0 0"/>"#, r#"is "0 0", expected 3 numbers"#),
-            ("fixed", r#"<origin rpy="0 0 1" quat_xyzw="0 0 0 1"/>"#, "a rotation as rpy and one as quat_xyzw"),
+            (
+                "fixed",
+                r#"<origin rpy="0 0 1" quat_xyzw="0 0 0 1"/>"#,
+                "<origin> has both rpy and quat_xyzw; remove one",
+            ),
             (
                 "fixed",
                 r#"<origin xyz="1 0 0"/><origin xyz="2 0 0"/>"#,
                 "two different elements <origin>, in lines 2 and 2",
             ),
-            ("revolute", r#"<axis xyz="0 0 0"/>"#, "its axis is zero"),
+            ("revolute", r#"<axis xyz="0 0 0"/>"#, "xyz of <axis> is zero, expected a direction"),
             (
                 "revolute",
                 r#"<mimic joint="k" multiplier="inf"/>"#,
                 r#"multiplier of <mimic> is "inf", expected a number"#,
             ),
             ("revolute", r#"<mimic multiplier="1"/>"#, r#"<mimic> has no attribute "joint""#),
-            ("ball", "", r#"its type is "ball", which does not exist"#),
+            (
+                "ball",
+                "",
+                r#"unknown type "ball", expected fixed, revolute, continuous, prismatic, floating, planar or spherical"#,
+            ),
         ] {
             let robot = robot(&(sound.clone() + "\n" + &joint_xml("j", kind, "a", "b", rest))).unwrap();
             let message = crate::Chain::new(&robot, "a", "b").unwrap_err().to_string();
@@ -389,11 +398,14 @@ mod tests {
         let inertial = |inside: &str| format!(r#"<link name="d"><inertial>{inside}</inertial></link>"#);
         let limit = |text: &str| joint_xml("j", "revolute", "a", "b", &format!("<limit {text}/>"));
         for (body, expected) in [
-            (limit(r#"lower="1" upper="-1""#), r#"joint "j": its range is 1 to -1"#),
+            (
+                limit(r#"lower="1" upper="-1""#),
+                r#"joint "j": lower of <limit> is 1, above upper, which is -1; the joint has no range and is not moved"#,
+            ),
             (limit(r#"lower="nan" upper="1""#), r#"joint "j": lower of <limit> is "nan", expected a number"#),
             (limit(r#"lower="-1" upper="1" safe="2""#), r#"the attribute "safe" in <limit> is not used"#),
             (joint_xml("j", "revolute", "a", "b", r#"<orgin xyz="1 0 0"/>"#), "<orgin> in <joint> is not used"),
-            ("<xacro:arm/>".to_owned(), "<xacro:arm>, which xacro was to expand, in <robot> is not used"),
+            ("<xacro:arm/>".to_owned(), "<xacro:arm>, which xacro has not expanded, in <robot> is not used"),
             (
                 inertial(r#"<inertia ixx="1"/>"#),
                 r#"the inertia of link "d" is invalid (it is not used): it has no <mass>"#,
@@ -415,7 +427,7 @@ mod tests {
             assert!(note.starts_with("line 1: ") && note.ends_with(expected), "{note}");
         }
         let many = joint_xml("j", "fixed", "a", "b", "<x/><x/>\n<x/>");
-        assert_eq!(robot(&many).unwrap().notes(), ["line 1 and 2 more times: <x> in <joint> is not used"]);
+        assert_eq!(robot(&many).unwrap().notes(), ["line 1 (and 2 more): <x> in <joint> is not used"]);
         let unnamed = visual(&format!(r#"{sphere}<material><color rgba="1 0 0 1"/></material>"#));
         let unnamed = robot(&unnamed).unwrap();
         assert_eq!((unnamed.notes().len(), unnamed.visuals("d")[0].color_srgba), (0, Some([1.0, 0.0, 0.0, 1.0])));
@@ -456,10 +468,10 @@ mod tests {
         let named: String = (0..3000).map(|ix| format!(" a{ix}=''")).collect();
         let namespaces: String = (0..200).map(|ix| format!("<a xmlns:n{ix}='x'/>")).collect();
         for (text, what) in [
-            (format!("<robot{named}/>"), "3000 attributes in one element, at most 2000"),
-            (format!("<robot>{namespaces}</robot>"), "200 namespaces, at most 100"),
+            (format!("<robot{named}/>"), "3000 attributes in one element exceed the maximum of 2000"),
+            (format!("<robot>{namespaces}</robot>"), "200 namespaces exceed the maximum of 100"),
             (format!("<robot>{}</robot>", "<a/>".repeat(1 << 20)), "nodes limit reached"),
-            (" ".repeat(MAX_BYTES + 1), "16777217 bytes, at most 16777216"),
+            (" ".repeat(MAX_BYTES + 1), "16777217 bytes exceed the maximum of 16777216"),
             ("<sdf/>".to_owned(), "it describes a <sdf>, expected a <robot>"),
         ] {
             let message = error_message(Robot::parse(&text));

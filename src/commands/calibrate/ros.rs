@@ -4,7 +4,8 @@
 
 use serde_json::{Map, Value, json};
 
-/// Converts `camera_info`, as a message or as a file, to our keys. Other values are unchanged.
+/// Replaces a ROS `CameraInfo` object, of a message or file, by one with our keys; leaves an object without a camera matrix
+/// unchanged.
 ///
 /// ROS counts pixels from the center of the first one, so half a pixel is added to the principal point.
 ///

@@ -64,7 +64,7 @@ impl SplatArrays {
     /// infinite opacity is limited.
     ///
     /// # Errors
-    /// If the arrays do not match, or no splat is valid although there are some.
+    /// If the lengths of the arrays do not match, or there are splats but none is valid.
     pub(crate) fn without_invalid(mut self, path: &Path) -> Result<Self, Error> {
         const MAX_LOGIT: f32 = 30.0;
         self.check_lengths()?;
@@ -84,7 +84,7 @@ impl SplatArrays {
         }
         let first = (0..self.n_splats()).find(|ix| !is_valid(*ix)).unwrap_or_default();
         log::warn!(
-            "{}: {n_invalid} of {} splats are left out, because a number of theirs is not finite or their rotation is zero; the first is splat {first}",
+            "{}: left out {n_invalid} of {} splats with a non-finite number or a zero rotation; the first has index {first}",
             path.display(),
             self.n_splats()
         );

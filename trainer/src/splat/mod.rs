@@ -57,6 +57,6 @@ pub use trial_steps::TrialSteps;
 pub use trials::CountPolicy;
 pub use work_counts::WorkCounts;
 
-/// Note about files that were made for another renderer.
-const ANTIALIASED: &str = "its splats were trained with the antialiasing of Mip-Splatting, which is not applied: small and distant \
-    splats are drawn too bright";
+/// Note about files that were trained with the opacity correction of Mip-Splatting.
+const ANTIALIASED: &str = "its splats were trained with the antialiasing of Mip-Splatting, which fieldrig does not apply: \
+    small and distant splats are drawn too opaque";

@@ -171,6 +171,8 @@ fn not_json_hint(text: &str) -> &'static str {
     let has = |word: &str| text.split(|c: char| !c.is_ascii_alphabetic()).any(|found| found == word);
     if ["NaN", "nan", "Infinity", "inf"].into_iter().any(has) {
         "; NaN and infinity are not JSON: remove the samples that contain them"
+    } else if text.starts_with("%YAML:") {
+        "; this is YAML of OpenCV, expected JSON with the keys of docs/guide/calibration.md"
     } else if ros::is_yaml(text) {
         "; this is YAML, expected JSON with the keys of docs/guide/calibration.md. To convert YAML: python3 -c \"import json, sys, yaml; \
          json.dump(yaml.safe_load(sys.stdin), sys.stdout)\" < FILE.yaml > FILE.json"

@@ -17,7 +17,7 @@ struct Element<'a> {
     count: usize,
     row_bytes: usize,
     properties: Vec<Property>,
-    /// The last property of an element may be a list: the types of its length and its numbers.
+    /// Types of length and numbers of the list property, which must be the last; `None` without one.
     list: Option<[NumberType; 2]>,
     /// The rows, little-endian; an error if they are not in the file.
     rows: Result<Cow<'a, [u8]>, String>,
@@ -88,7 +88,7 @@ impl NumberType {
         })
     }
 
-    /// The number whose little-endian bytes these are, as a length; `None` if it is not one.
+    /// Decodes little-endian bytes as the length of a list; `None` for negative numbers and floats.
     fn length(self, bytes: &[u8]) -> Option<usize> {
         match self {
             Self::U8 => Some(usize::from(*bytes.first()?)),
@@ -191,7 +191,7 @@ impl<'a> Header<'a> {
         Ok(())
     }
 
-    /// Finds the rows of each element. After the first that is not complete, none is.
+    /// Finds the rows of each element up to the first incomplete one; later ones keep their error.
     fn locate_binary(&mut self, mut rest: &'a [u8], format: Format) {
         for element in &mut self.elements {
             let n_bytes = match element.list {
@@ -227,7 +227,10 @@ impl<'a> Header<'a> {
                     let word = next()?;
                     let Some(bytes) = property.number_type.little_endian(word) else {
                         let shown: String = word.chars().take(30).collect();
-                        return Some(Err(format!("{}: {shown:?} is not a number of this type", property.name)));
+                        return Some(Err(format!(
+                            "{}: {shown:?} is not a valid {:?}",
+                            property.name, property.number_type
+                        )));
                     };
                     rows.extend(bytes);
                 }

@@ -95,8 +95,8 @@ fn is_used(name: &str, color: &ColorColumns<'_>) -> bool {
         || ["scale_", "rot_", "f_rest_"].iter().any(|start| name.starts_with(start))
 }
 
-/// Applies the 3D filter of Mip-Splatting (Yu et al. 2024), as its renderer does: the splat becomes wider by the filter's
-/// width, and its opacity lower by the ratio of the volumes.
+/// Applies the 3D filter of Mip-Splatting (Yu et al. 2024), as its renderer does: adds the filter's variance
+/// to the variance along each axis, and multiplies the opacity by the ratio of the old volume to the new.
 fn widen(splats: &mut SplatArrays, row: usize, filter_m: f32) {
     let variances = splats.log_scales[row].map(|log_scale| (2.0 * log_scale).exp());
     let widened = variances.map(|variance| variance + filter_m * filter_m);

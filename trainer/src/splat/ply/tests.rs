@@ -70,7 +70,7 @@ fn broken_files_are_rejected_with_the_reason() {
     let text = String::from_utf8_lossy(&file).into_owned();
     assert!(error_of(text.replace("binary_little_endian", "utf8").as_bytes()).contains("unknown format \"utf8\""));
     let binary_in_text = text.replace("binary_little_endian", "ascii").replace("vertex 5", "vertex 1");
-    assert!(error_of(&[binary_in_text.as_bytes(), &b" x ".repeat(20)].concat()).contains("of this type"));
+    assert!(error_of(&[binary_in_text.as_bytes(), &b" x ".repeat(20)].concat()).contains("is not a valid F32"));
     assert!(error_of(text.replace("opacity", "opacitx").as_bytes()).contains("no property \"opacity\""));
     assert!(error_of(text.replace("vertex 5", "vertex 99999999999999999999").as_bytes()).contains("not a number"));
     assert!(error_of(text.replace("vertex 5", "vertex 9999999999999999999").as_bytes()).contains("truncated"));

@@ -31,9 +31,10 @@ const IS_ANTIALIASED: u8 = 1;
 const HAS_EXTENSIONS: u8 = 2;
 /// Maximum number of splats. A larger number in a header indicates damage.
 const MAX_SPLATS: u32 = 100_000_000;
-/// Splats are compressed by a factor of 2 to 4. Larger bodies are accepted up to this factor, or this size.
+/// Maximum ratio of uncompressed to compressed size. Files of splats have 2 to 4.
 const MAX_COMPRESSION: u64 = 50;
-const MIN_COMPRESSED_BYTES: u64 = 64 << 20;
+/// Uncompressed size that is accepted at any ratio.
+const ALWAYS_ACCEPTED_BYTES: u64 = 64 << 20;
 /// Maximum number of fractional bits of a mean, for steps of 15 micrometers.
 const MAX_FRACTIONAL_BITS: u8 = 16;
 /// Factors of the higher color coefficients when y and z change their signs: -1 for basis functions that change sign.
@@ -142,7 +143,7 @@ fn from_bytes(bytes: &[u8]) -> Result<(SplatArrays, Vec<String>), String> {
     let mut header = [0; HEADER_BYTES];
     gzip.read_exact(&mut header).map_err(|error| read_error(&error))?;
     let header = Header::parse(header)?;
-    let max_body_bytes = MIN_COMPRESSED_BYTES.max(MAX_COMPRESSION * bytes.len() as u64);
+    let max_body_bytes = ALWAYS_ACCEPTED_BYTES.max(MAX_COMPRESSION * bytes.len() as u64);
     if header.n_body_bytes() > max_body_bytes {
         return Err(format!(
             "the header specifies {} splats, which a file of {} bytes cannot contain",
