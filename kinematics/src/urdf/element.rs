@@ -1,10 +1,11 @@
 //! Elements and attributes of a robot description, and notes about those that are not used.
 
-use super::MAX_BYTES;
 use crate::Error;
 use roxmltree::{Document, Node, ParsingOptions};
 use std::collections::BTreeMap;
 
+/// Maximum size of a robot description.
+pub const MAX_BYTES: usize = 16 << 20;
 const MAX_NODES: u32 = 1 << 20;
 /// The parser's time grows with the square of an element's attributes, and with the cube of nested namespaces.
 const MAX_ATTRIBUTES: usize = 2000;

@@ -1,7 +1,7 @@
 //! Reads one joint of a robot description.
 
 use super::element::{Element, Notes, Problem};
-use super::{Joint, JointKind, JointLimits, Mimic};
+use super::model::{Joint, JointKind, JointLimits, Mimic};
 use crate::{Error, Transform};
 use nalgebra::{Quaternion, Translation3, Unit, UnitQuaternion, Vector3};
 

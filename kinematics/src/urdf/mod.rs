@@ -4,15 +4,15 @@
 
 pub(crate) mod element;
 pub(crate) mod joint;
+mod model;
 
 use crate::shape::{self, Shape};
-use crate::{Error, Transform};
+use crate::Error;
 use element::{Element, Notes};
-use nalgebra::{Unit, Vector3};
 use std::collections::{HashMap, HashSet};
 
-/// Maximum size of a robot description.
-pub const MAX_BYTES: usize = 16 << 20;
+pub use element::MAX_BYTES;
+pub use model::{Joint, JointKind, JointLimits, Mimic};
 
 /// Links and joints of one robot. The links of every joint exist, no link has two parents, there is no cycle, and all
 /// numbers of valid joints except limits are finite.
@@ -27,80 +27,6 @@ pub struct Robot {
     /// Visual and collision shapes of each link that has any.
     shapes: HashMap<String, shape::LinkShapes>,
     notes: Vec<String>,
-}
-
-/// One joint between two links.
-#[derive(Clone, Debug)]
-pub struct Joint {
-    /// Name in the URDF.
-    pub name: String,
-    /// Type of motion.
-    pub kind: JointKind,
-    /// Parent link.
-    pub parent: String,
-    /// Child link; its frame moves with the joint.
-    pub child: String,
-    /// Pose of the joint's frame in the parent link at joint value 0.
-    pub parent_from_joint: Transform,
-    /// Direction of motion in the joint's frame; unused for fixed joints.
-    pub axis: Unit<Vector3<f64>>,
-    /// Allowed range.
-    pub limits: JointLimits,
-    /// The joint that this joint follows; `None` if it moves independently.
-    pub mimic: Option<Mimic>,
-    /// Why the joint cannot be part of a chain. If there is an error, only the names above are valid.
-    pub problem: Option<Error>,
-}
-
-/// Type of a joint's motion.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum JointKind {
-    /// No motion.
-    Fixed,
-    /// Rotation about the axis, radians (revolute or continuous).
-    Revolute,
-    /// Translation along the axis, meters (prismatic).
-    Prismatic,
-    /// A type with more than one degree of freedom, with its name in the URDF, or "invalid".
-    Unsupported(&'static str),
-}
-
-/// Allowed range of a joint; infinite if the URDF sets no limit, or the limits are zero.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct JointLimits {
-    /// Smallest position, radians or meters.
-    pub lower: f64,
-    /// Largest position, radians or meters.
-    pub upper: f64,
-    /// Largest speed, radians or meters per second.
-    pub velocity: f64,
-    /// Largest torque or force, newton meters or newtons.
-    pub effort: f64,
-    /// False if the URDF states a range that is invalid. `lower` and `upper` are then infinite, and a program should not
-    /// move the joint.
-    pub is_range_valid: bool,
-}
-
-impl JointLimits {
-    /// No limits.
-    pub const NONE: Self = Self {
-        lower: f64::NEG_INFINITY,
-        upper: f64::INFINITY,
-        velocity: f64::INFINITY,
-        effort: f64::INFINITY,
-        is_range_valid: true,
-    };
-}
-
-/// Rule by which a mimic joint follows another: `multiplier * source + offset`.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Mimic {
-    /// Name of the followed joint.
-    pub source: String,
-    /// Factor on the source's value.
-    pub multiplier: f64,
-    /// Offset added to the scaled value, radians or meters.
-    pub offset: f64,
 }
 
 impl Robot {
