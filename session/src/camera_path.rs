@@ -6,7 +6,7 @@ use keyframe::ensure;
 use kinematics::{Transform, transform};
 use serde::Deserialize;
 use serde_json::Value;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
 /// One viewpoint.
@@ -84,17 +84,23 @@ impl PathFile {
             Ok::<_, crate::Error>(Some(side_px as u32))
         };
         let (width, height) = (side("render_width", self.render_width)?, side("render_height", self.render_height)?);
+        ensure!(width.is_some() == height.is_some(), "render_width and render_height must be given together");
         Ok(width.zip(height).map(|(width, height)| [width, height]))
     }
 
     fn notes(&self) -> Vec<String> {
-        let of_cameras = self.camera_path.iter().flat_map(|camera| camera.other.keys());
-        let mut unknown: Vec<&str> =
-            self.other.keys().chain(of_cameras).map(String::as_str).filter(|key| !UNUSED.contains(key)).collect();
-        unknown.sort_unstable();
-        unknown.dedup();
-        let advice = |key: &str| if key == "crop" { "; use --crop" } else { "" };
-        unknown.iter().map(|key| format!("{key:?} is not used{}", advice(key))).collect()
+        const MAX_NAMED: usize = 5;
+        let of_cameras = self.camera_path.iter().flat_map(|camera| &camera.other);
+        let is_unknown = |key: &str, value: &Value| !UNUSED.contains(&key) && !value.is_null();
+        let all = self.other.iter().chain(of_cameras).filter(|(key, value)| is_unknown(key, value));
+        let unknown: BTreeSet<&str> = all.map(|(key, _)| key.as_str()).collect();
+        if unknown.is_empty() {
+            return Vec::new();
+        }
+        let named: Vec<String> = unknown.iter().take(MAX_NAMED).map(|key| format!("{key:?}")).collect();
+        let more = if unknown.len() > MAX_NAMED { ", ..." } else { "" };
+        let advice = if unknown.contains("crop") { "; for \"crop\", use --crop" } else { "" };
+        vec![format!("unknown keys are not used: {}{more}{advice}", named.join(", "))]
     }
 }
 
@@ -196,7 +202,10 @@ mod tests {
             viewer["camera_path"][0][*key] = 1.into();
         }
         assert_eq!(parse(&viewer).expect("as the viewer writes it"), parse(&plain).expect("a path"));
-        for (key, note) in [("crop", "\"crop\" is not used; use --crop"), ("smooth", "\"smooth\" is not used")] {
+        for (key, note) in [
+            ("crop", "unknown keys are not used: \"crop\"; for \"crop\", use --crop"),
+            ("smooth", "unknown keys are not used: \"smooth\""),
+        ] {
             let mut changed = plain.clone();
             changed[key] = 1.into();
             assert_eq!(parse(&changed).expect("a path").notes, [note]);
@@ -210,8 +219,8 @@ mod tests {
         for size in ["0", "7.5", "-8", "1e9", "null"] {
             let text = plain.to_string().replace("\"render_width\":8", &format!("\"render_width\":{size}"));
             match CameraPath::parse(&text) {
-                Err(error) => assert!(error.to_string().contains("render_width is"), "{error}"),
-                Ok(path) => assert!(size == "null" && path.size_px.is_none()),
+                Err(error) => assert!(error.to_string().contains("render_width "), "{error}"),
+                Ok(path) => panic!("{size}: {:?}", path.size_px),
             }
         }
     }

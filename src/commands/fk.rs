@@ -45,10 +45,10 @@ struct Poses<'a> {
 pub(crate) fn run(args: Args) -> anyhow::Result<()> {
     let urdf = read(&args.urdf)?;
     let robot = Robot::parse(&urdf).with_context(|| args.urdf.display().to_string())?;
+    let chain = chain(&robot, &args).with_context(|| args.urdf.display().to_string())?;
     for note in robot.notes() {
         log::warn!("{}: {note}", args.urdf.display());
     }
-    let chain = chain(&robot, &args).with_context(|| args.urdf.display().to_string())?;
     let joints = read(&args.joints)?;
     let poses = poses(&robot, &chain, &joints).with_context(|| args.joints.display().to_string())?;
     print::json(&Poses { tip: &args.tip, poses })

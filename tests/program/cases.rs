@@ -115,7 +115,7 @@ fn camera_paths_of_the_viewer() {
     for (file, out) in [("int.json", "int"), ("float.json", "float"), ("crop.json", "crop")] {
         let (code, printed) = render(file, &[], out);
         assert_eq!(code, Some(0), "{printed}");
-        assert_eq!(printed.contains("\"crop\" is not used; use --crop"), file == "crop.json", "{printed}");
+        assert_eq!(printed.contains("for \"crop\", use --crop"), file == "crop.json", "{printed}");
         assert_eq!(picture(out), picture("int"));
     }
     let (code, printed) = render("equirect.json", &[], "none");
@@ -303,7 +303,7 @@ fn joint_states_of_ros() {
         assert!(!printed.contains("rejected a datagram") && !printed.contains("did not arrive"), "{mode}: {printed}");
         assert!(printed.contains("joint states"), "{mode}: {printed}");
         assert_eq!(
-            printed.contains("ignored a state that names none of the arm's joints"),
+            printed.contains("ignoring states that name none of the arm's joints"),
             other == 1,
             "{mode}: {printed}"
         );

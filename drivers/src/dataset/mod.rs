@@ -7,6 +7,7 @@ pub mod tum;
 pub use posed_image::{DatasetImage, DepthFile, DepthImage, ListedSplit, LoadedImage};
 
 use crate::Error;
+use kinematics::Intrinsics;
 use std::path::{Path, PathBuf};
 
 /// The usable images of a folder.
@@ -51,6 +52,25 @@ pub fn read(path: &Path) -> Result<Dataset, Error> {
         return tum::read(path);
     }
     Err(Error::NotADataset { path: path.to_owned() })
+}
+
+/// Describes a focal length or principal point that no camera has, such as the result of a division by almost zero.
+fn implausible(intrinsics: &Intrinsics) -> Option<String> {
+    /// Relative to the longer side: fields of view from 0.06 to 176 degrees.
+    const FOCAL: std::ops::RangeInclusive<f64> = 0.02..=1000.0;
+    /// Relative to the size: images may be cut out of larger ones.
+    const CENTER: std::ops::RangeInclusive<f64> = -1.0..=2.0;
+    let [width, height] = intrinsics.size_px.map(f64::from);
+    let longer = width.max(height);
+    let focal = intrinsics.focal_px.iter().any(|focal_px| !FOCAL.contains(&(focal_px / longer)));
+    let [x, y] = intrinsics.principal_px;
+    let center = !(CENTER.contains(&(x / width)) && CENTER.contains(&(y / height)));
+    (focal || center).then(|| {
+        format!(
+            "focal lengths {:?} and principal point {:?} are implausible for {width} x {height} pixels",
+            intrinsics.focal_px, intrinsics.principal_px
+        )
+    })
 }
 
 /// Positions beyond this are assumed to be mistakes, meters.

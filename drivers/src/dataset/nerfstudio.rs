@@ -3,7 +3,9 @@
 //! Cameras in these files look along -z with y up (OpenGL). Poses are converted to our convention only in this module.
 
 use super::posed_image::image_size_px;
-use super::{Dataset, DatasetImage, DepthFile, ListedSplit, MAX_POSITION_M, SkippedImages, first_names, plural};
+use super::{
+    Dataset, DatasetImage, DepthFile, ListedSplit, MAX_POSITION_M, SkippedImages, first_names, implausible, plural,
+};
 use crate::Error;
 use crate::wire::json;
 use kinematics::{Intrinsics, Lens, Stamp, Transform, transform};
@@ -16,6 +18,8 @@ use std::path::{Path, PathBuf};
 
 /// File that identifies such a folder.
 pub const FILE_NAME: &str = "transforms.json";
+/// Matrices with one decimal deviate from a rotation by up to this.
+const MAX_ROUNDING: f64 = 0.2;
 /// Relative difference of two focal lengths that are meant to be equal.
 const MAX_FOCAL_DIFFERENCE: f64 = 0.01;
 /// Depth counts are millimeters unless the file specifies another unit.
@@ -149,7 +153,8 @@ pub fn read(path: &Path) -> Result<Dataset, Error> {
         });
     }
     let names: BTreeSet<String> = document.frames.iter().map(|entry| normalized(&entry.file_path)).collect();
-    let absent: Vec<String> = splits.keys().filter(|name| !names.contains(*name)).cloned().collect();
+    let mut absent: Vec<String> = splits.keys().filter(|name| !names.contains(*name)).cloned().collect();
+    absent.sort_unstable();
     for (names, what) in [
         (&unlisted, "not used, because train_filenames, val_filenames and test_filenames do not contain them"),
         (&absent, "only in train_filenames, val_filenames or test_filenames, but not in frames"),
@@ -174,10 +179,11 @@ pub fn read(path: &Path) -> Result<Dataset, Error> {
             first_names(&unlisted)
         )));
     }
-    let n_missing_depth = document.frames.iter().filter(|entry| entry.lacks_depth(&folder)).count();
-    if n_missing_depth > 0 {
-        let (images, verb) = plural(n_missing_depth, "depth image");
-        notes.push(format!("{images} {verb} missing"));
+    let lacking = document.frames.iter().filter(|entry| entry.lacks_depth(&folder));
+    let missing_depth: Vec<String> = lacking.filter_map(|entry| entry.depth_file_path.clone()).collect();
+    if !missing_depth.is_empty() {
+        let (images, verb) = plural(missing_depth.len(), "depth image");
+        notes.push(format!("{images} {verb} missing: {}", first_names(&missing_depth)));
     }
     skipped.dataset(&folder, images, notes)
 }
@@ -335,6 +341,12 @@ fn rows_of(matrix: &Matrix) -> Result<[f64; 16], String> {
 /// Converts an OpenGL camera pose to our convention. Also returns whether its numbers are rounded.
 fn world_from_camera(rows: &[f64; 16]) -> Result<(Transform, bool), String> {
     let (world_from_opengl, is_rounded) = transform::from_rounded_rows(rows).map_err(|error| match error {
+        kinematics::Error::NotRigid { determinant, .. } if determinant < 0.0 => {
+            format!("{error}; it is mirrored: check the sign of each axis")
+        }
+        kinematics::Error::NotRigid { off, .. } if off > MAX_ROUNDING => {
+            format!("{error}; expected a rotation without scale and shear")
+        }
         kinematics::Error::NotRigid { .. } => {
             format!("{error}; if the numbers were rounded, write at least four decimals")
         }
@@ -392,6 +404,11 @@ impl CameraEntry {
         let size_px = self.size_px().unwrap_or(image_px);
         let [width, height] = size_px.map(f64::from);
         let focal_px = |given: (&str, Option<f64>), angle: (&str, Option<f64>), side_px: f64| {
+            if let (name, Some(angle_rad)) = angle
+                && !(angle_rad > 0.0 && angle_rad < std::f64::consts::PI)
+            {
+                return Err(format!("{name} is {angle_rad}, expected radians from 0 to pi; is it in degrees?"));
+            }
             let from_angle = angle.1.map(|angle_rad| 0.5 * side_px / (0.5 * angle_rad).tan());
             match (given.1, from_angle) {
                 // Angles are usually written with fewer digits.
@@ -415,22 +432,10 @@ impl CameraEntry {
             rectified: false,
         };
         reported.validate().map_err(|error| error.to_string())?;
-        if let Some((name, value)) = self.implausible(size_px) {
-            return Err(format!(
-                "{name} is {value:e}, which is implausible for {} x {} pixels",
-                size_px[0], size_px[1]
-            ));
+        if let Some(reason) = implausible(&reported) {
+            return Err(reason);
         }
         Ok(reported.resized(image_px))
-    }
-
-    /// A focal length or principal point that no camera has: such as the result of a division by almost zero.
-    fn implausible(&self, [width, height]: [u32; 2]) -> Option<(&'static str, f64)> {
-        let longest_px = f64::from(width.max(height));
-        let focal = [("fl_x", self.fl_x), ("fl_y", self.fl_y)].map(|(name, value)| (name, value, 1e3 * longest_px));
-        let center = [("cx", self.cx), ("cy", self.cy)].map(|(name, value)| (name, value, 10.0 * longest_px));
-        let mut all = focal.into_iter().chain(center);
-        all.find_map(|(name, value, max)| value.filter(|value| value.abs() > max).map(|value| (name, value)))
     }
 
     fn lens(&self) -> Result<Lens, String> {
@@ -455,7 +460,9 @@ impl CameraEntry {
                     (true, false) => Ok(Lens::BrownConrady(coefficients)),
                 }
             }
-            Some(other) => Err(format!("camera_model is {other:?}, expected OPENCV, OPENCV_FISHEYE or PINHOLE")),
+            Some(other) => Err(format!(
+                "camera_model is {other:?}, expected OPENCV, PINHOLE, SIMPLE_PINHOLE, SIMPLE_RADIAL, RADIAL or OPENCV_FISHEYE"
+            )),
         }
     }
 }

@@ -127,7 +127,7 @@ fn masks_and_resized_depth_are_decoded() {
     document["depth_unit_scale_factor"] = json!(0.0002);
     write_transforms(&folder, &document);
     let dataset = read(folder.path()).unwrap();
-    assert_eq!(dataset.notes, ["1 depth image is missing"]);
+    assert_eq!(dataset.notes, ["1 depth image is missing: lost.png"]);
     let loaded = dataset.images[0].load().unwrap();
     let alphas: Vec<u8> = loaded.rgba_srgb.chunks_exact(4).take(8).map(|pixel| pixel[3]).collect();
     assert_eq!(alphas, [0, 0, 255, 255, 255, 255, 255, 255]);
@@ -322,8 +322,12 @@ fn tum_intrinsics_come_from_file_or_folder_name() {
     for name in ["rgb", "depth", "rgb.txt", "depth.txt", "groundtruth.txt"] {
         std::fs::rename(folder.path().join(name), named.join(name)).unwrap();
     }
+    assert!(read(&named).unwrap_err().to_string().contains("are implausible for 8 x 6 pixels"));
+    for photo in std::fs::read_dir(named.join("rgb")).unwrap() {
+        RgbImage::new(640, 480).save(photo.unwrap().path()).unwrap();
+    }
     let intrinsics = read(&named).unwrap().images[0].intrinsics.clone();
-    assert_eq!((intrinsics.focal_px[0], intrinsics.size_px), (517.306_408, [8, 6]));
+    assert_eq!((intrinsics.focal_px[0], intrinsics.size_px), (517.306_408, [640, 480]));
     assert_eq!(intrinsics.lens, Lens::BrownConrady([0.262_383, -0.953_104, -0.005_358, 0.002_628, 1.163_314]));
     std::fs::write(named.join("calibration.txt"), "500 500 1").unwrap();
     assert!(read(&named).unwrap_err().to_string().contains("3 numbers"));
@@ -406,10 +410,27 @@ fn rounded_poses_are_read_with_a_note() {
         }
     }
     assert!(n_notes[0] > 0 && n_notes[1] == 0, "{n_notes:?}");
-    document["frames"][1]["transform_matrix"][0][0] = json!(0.9);
-    write_transforms(&folder, &document);
-    let lost = &read(folder.path()).unwrap().data_losses[0];
-    assert!(lost.contains("not rigid") && lost.contains("write at least four decimals"), "{lost}");
+    for (first, hint) in [(0.6, "write at least four decimals"), (2.0, "without scale"), (-1.0, "it is mirrored")] {
+        document["frames"][1]["transform_matrix"] = json!([[first, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]);
+        if hint == "write at least four decimals" {
+            document["frames"][1]["transform_matrix"][0][0] = json!(0.99);
+        }
+        write_transforms(&folder, &document);
+        let lost = &read(folder.path()).unwrap().data_losses[0];
+        assert!(lost.contains("not rigid") && lost.contains(hint), "{lost}");
+    }
+    document["frames"][1]["transform_matrix"] = identity_rows();
+    for (key, value, reason) in [
+        ("fl_x", json!(1e-6), "are implausible for 8 x 6 pixels"),
+        ("cx", json!(1e3), "are implausible"),
+        ("camera_angle_x", json!(45), "is it in degrees?"),
+        ("camera_model", json!("FISHEYE624"), "SIMPLE_RADIAL"),
+    ] {
+        let mut changed = document.clone();
+        changed[key] = value;
+        write_transforms(&folder, &changed);
+        assert!(read_error(&folder).contains(reason), "{}", read_error(&folder));
+    }
 }
 
 #[test]

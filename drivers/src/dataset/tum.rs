@@ -4,7 +4,7 @@
 //! benchmark.
 
 use super::posed_image::image_size_px;
-use super::{Dataset, DatasetImage, DepthFile, MAX_POSITION_M, SkippedImages, first_names, plural};
+use super::{Dataset, DatasetImage, DepthFile, MAX_POSITION_M, SkippedImages, first_names, implausible, plural};
 use crate::Error;
 use kinematics::{Intrinsics, Lens, Stamp, Transform, transform};
 use nalgebra::{Quaternion, UnitQuaternion, Vector3};
@@ -49,9 +49,13 @@ pub fn read(folder: &Path) -> Result<Dataset, Error> {
         false => Vec::new(),
     };
     let poses = Poses::read(folder, &mut skipped)?;
-    let mut images = Vec::new();
+    let (mut images, mut missing_depth): (Vec<DatasetImage>, Vec<String>) = (Vec::new(), Vec::new());
     let mut n_without_depth = 0;
     for (stamp, name) in colors {
+        if images.last().is_some_and(|last| last.stamp == stamp) {
+            skipped.unusable.push((name, "another photo has the same time".to_owned()));
+            continue;
+        }
         let image_path = folder.join(&name);
         if !image_path.is_file() {
             skipped.missing.push(name);
@@ -70,10 +74,20 @@ pub fn read(folder: &Path) -> Result<Dataset, Error> {
         };
         let depth = nearest(&depths, stamp).and_then(|(depth_stamp, depth_name)| {
             let (path, pose) = (folder.join(depth_name), poses.at(*depth_stamp).ok()?);
-            path.is_file().then_some(DepthFile { path, meters_per_count: METERS_PER_COUNT, world_from_camera: pose })
+            Some(DepthFile { path, meters_per_count: METERS_PER_COUNT, world_from_camera: pose })
         });
         n_without_depth += usize::from(depth.is_none());
+        let depth = depth.filter(|depth| {
+            let exists = depth.path.is_file();
+            if !exists {
+                missing_depth.push(depth.path.strip_prefix(folder).unwrap_or(&depth.path).display().to_string());
+            }
+            exists
+        });
         let intrinsics = Intrinsics { size_px, ..camera.clone() };
+        if let Some(reason) = implausible(&intrinsics) {
+            return Err(Error::DatasetFile { path: folder.to_owned(), reason });
+        }
         images.push(DatasetImage {
             name,
             intrinsics,
@@ -85,11 +99,16 @@ pub fn read(folder: &Path) -> Result<Dataset, Error> {
             listed: None,
         });
     }
-    let notes = match n_without_depth {
+    let mut notes = match n_without_depth {
+        _ if depths.is_empty() => Vec::new(),
         0 => Vec::new(),
         1 => vec!["1 photo has no depth image within 20 ms".to_owned()],
         n => vec![format!("{n} photos have no depth image within 20 ms")],
     };
+    if !missing_depth.is_empty() {
+        let (what, verb) = plural(missing_depth.len(), "depth image");
+        notes.push(format!("{what} {verb} missing: {}", first_names(&missing_depth)));
+    }
     skipped.dataset(folder, images, notes)
 }
 

@@ -93,6 +93,7 @@ impl DatagramCounts {
             n_restarts,
             n_clock_restarts,
         } = self;
+        // States of other joints are no problem.
         let problems = [n_rejected, n_lost, n_foreign, n_late, n_dropped, n_uncertain, n_restarts, n_clock_restarts];
         if problems.iter().any(|n| **n > 0) {
             log::warn!(

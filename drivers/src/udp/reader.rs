@@ -95,9 +95,12 @@ impl DatagramReader {
             }
         }
         let Some(reading) = reading else {
-            let what =
-                "ignored a state that names none of the arm's joints; if these are its joints, correct arm.joints";
-            count_and_warn(device, &mut counts.n_other, 1, what);
+            if counts.n_other == 0 {
+                log::info!(
+                    "{device}: ignoring states that name none of the arm's joints; if these are its joints, correct arm.joints"
+                );
+            }
+            counts.n_other += 1;
             return None;
         };
         let n_before = sequence.n_clock_restarts();

@@ -24,7 +24,14 @@ pub(super) fn parse(xml: &str) -> Result<Document<'_>, Error> {
     let n_attributes = |element: &str| element.bytes().filter(|byte| *byte == b'=').count();
     limited("attributes in one element", xml.split('<').map(n_attributes).max().unwrap_or(0), MAX_ATTRIBUTES)?;
     let options = ParsingOptions { nodes_limit: MAX_NODES, ..ParsingOptions::default() };
-    let document = Document::parse_with_options(xml, options).map_err(|error| syntax(error.to_string()))?;
+    let document = Document::parse_with_options(xml, options).map_err(|error| {
+        let hint = match &error {
+            roxmltree::Error::UnknownNamespace(prefix, _) if prefix == "xacro" => "; expand the file with xacro first",
+            roxmltree::Error::DtdDetected => "; remove the <!DOCTYPE>",
+            _ => "",
+        };
+        syntax(format!("{error}{hint}"))
+    })?;
     match document.root_element().tag_name().name() {
         "robot" => Ok(document),
         other => Err(syntax(format!("it describes a <{other}>, expected a <robot>"))),

@@ -6,8 +6,8 @@ pub(crate) mod element;
 pub(crate) mod joint;
 mod model;
 
-use crate::shape::{self, Shape};
 use crate::Error;
+use crate::shape::{self, Shape};
 use element::{Element, Notes};
 use std::collections::{HashMap, HashSet};
 

@@ -9,6 +9,8 @@ const MAX_HEADER_BYTES: usize = 64 * 1024;
 pub(super) struct Header<'a> {
     elements: Vec<Element<'a>>,
     comments: Vec<String>,
+    /// Number of bytes after the last row.
+    n_unread: usize,
 }
 
 /// One table: `count` rows of `properties`.
@@ -112,7 +114,7 @@ impl<'a> Header<'a> {
         });
         let (end, start) = end.ok_or("it has no PLY header")?;
         let text = std::str::from_utf8(&bytes[..end]).map_err(|_| "the header is not UTF-8")?;
-        let mut header = Self { elements: Vec::new(), comments: Vec::new() };
+        let mut header = Self { elements: Vec::new(), comments: Vec::new(), n_unread: 0 };
         let mut lines = text.lines().map(|line| line.trim_end_matches('\r'));
         if lines.next() != Some("ply") {
             return Err("the header does not begin with \"ply\"".to_owned());
@@ -130,6 +132,11 @@ impl<'a> Header<'a> {
 
     pub(super) fn has_element(&self, name: &str) -> bool {
         self.elements.iter().any(|element| element.name == name)
+    }
+
+    /// Number of bytes after the last row.
+    pub(super) fn n_unread(&self) -> usize {
+        self.n_unread
     }
 
     /// The texts of the comments.
@@ -208,12 +215,12 @@ impl<'a> Header<'a> {
                 _ => rows.into(),
             });
         }
+        self.n_unread = rest.len();
     }
 
     /// Converts the rows of each element to binary.
     fn read_ascii(&mut self, text: &[u8]) {
-        let mut words = text.split(u8::is_ascii_whitespace).filter(|word| !word.is_empty());
-        let mut next = || std::str::from_utf8(words.next()?).ok();
+        let mut lines = text.split(|byte| *byte == b'\n').filter(|line| !line.trim_ascii().is_empty());
         for element in &mut self.elements {
             // A number and a space take at least two bytes.
             let n_words = element.count.checked_mul(element.properties.len() + usize::from(element.list.is_some()));
@@ -223,8 +230,12 @@ impl<'a> Header<'a> {
             }
             let mut rows = Vec::with_capacity(element.count * element.row_bytes);
             let mut read_row = || -> Option<Result<(), String>> {
+                let mut words = std::str::from_utf8(lines.next()?).ok()?.split_ascii_whitespace();
+                let n_expected = element.properties.len();
+                let wrong = || Some(Err(format!("it does not have {n_expected} numbers")));
+                let mut next = || words.next();
                 for property in &element.properties {
-                    let word = next()?;
+                    let Some(word) = next() else { return wrong() };
                     let Some(bytes) = property.number_type.little_endian(word) else {
                         let shown: String = word.chars().take(30).collect();
                         return Some(Err(format!(
@@ -235,10 +246,12 @@ impl<'a> Header<'a> {
                     rows.extend(bytes);
                 }
                 if element.list.is_some() {
-                    let n: usize = next()?.parse().ok()?;
-                    (0..n).try_for_each(|_| next().map(drop))?;
+                    let Some(n) = next().and_then(|word| word.parse::<usize>().ok()) else { return wrong() };
+                    if (0..n).try_for_each(|_| next().map(drop)).is_none() {
+                        return wrong();
+                    }
                 }
-                Some(Ok(()))
+                if next().is_some() { wrong() } else { Some(Ok(())) }
             };
             let problem = (0..element.count).find_map(|row| match read_row() {
                 Some(Ok(())) => None,
@@ -251,6 +264,7 @@ impl<'a> Header<'a> {
             }
             element.rows = Ok(rows.into());
         }
+        self.n_unread = lines.map(<[u8]>::len).sum();
     }
 }
 

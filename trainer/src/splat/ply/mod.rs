@@ -48,6 +48,9 @@ fn from_bytes(bytes: &[u8]) -> Result<(SplatArrays, Vec<String>), String> {
     if header.comments().iter().any(|comment| comment.to_ascii_lowercase().replace(' ', "") == "splatrendermode:mip") {
         notes.push(crate::splat::ANTIALIASED.to_owned());
     }
+    if header.n_unread() > 0 {
+        notes.push(format!("{} bytes after the last row are not used", header.n_unread()));
+    }
     if header.has_element("chunk") {
         return Ok((packed::splats(&header)?, notes));
     }

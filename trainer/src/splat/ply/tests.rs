@@ -197,6 +197,12 @@ fn variants_of_other_programs_are_read() {
     let (_, notes) =
         from_bytes(&one_splat(&[&GEOMETRY[..], &COEFFICIENTS].concat(), "comment SplatRenderMode: mip\n")).unwrap();
     assert!(notes[0].contains("Mip-Splatting"), "{notes:?}");
+    let short = one_splat(&[&GEOMETRY[..], &COEFFICIENTS].concat(), "");
+    let row_end = short.len() - 5;
+    let why = from_bytes(&[&short[..row_end], b"\n"].concat()).unwrap_err();
+    assert!(why.contains("row 0 of \"vertex\": it does not have 14 numbers"), "{why}");
+    let (_, notes) = from_bytes(&[&short[..], b"1 2 3\n"].concat()).unwrap();
+    assert_eq!(notes, ["5 bytes after the last row are not used"]);
     let points = from_bytes(&one_splat(&[&GEOMETRY[..3], &channels].concat(), "")).unwrap_err();
     assert!(points.starts_with("it is a point cloud or a mesh"), "{points}");
     let higher: Vec<String> = (0..72).map(|ix| format!("f_rest_{ix}")).collect();
