@@ -122,7 +122,8 @@ fn every_format_gives_the_same_splats() {
     let start = file.windows(end.len()).position(|window| window == end).unwrap() + end.len();
     let (header, rows) = (String::from_utf8(file[..start].to_vec()).unwrap(), &file[start..]);
     let numbers: Vec<f32> = rows.as_chunks().0.iter().map(|bytes| f32::from_le_bytes(*bytes)).collect();
-    let text: String = numbers.iter().map(|number| format!("{number:?} ")).collect();
+    let in_text = |row: &[f32]| row.iter().map(|number| format!("{number:?} ")).collect::<String>() + "\n";
+    let text: String = numbers.chunks(numbers.len() / cloud.n_splats()).map(in_text).collect();
     let big_endian: Vec<u8> = numbers.iter().flat_map(|number| number.to_be_bytes()).collect();
     let format = |name: &str| header.replace("binary_little_endian", name);
     let with_faces = header.replace("end_header", "element face 2\nproperty list uchar int vertex_indices\nend_header");
