@@ -222,7 +222,11 @@ fn mistakes_are_explained() {
         ("chessboard:9x6:25mm", "tag:36h11:3:25mm", "no chessboard found in the image"),
         ("charuco:9x6:25mm:19mm:4X4_50", "charuco:9x6:25mm:19mm:6X6_250", "of 6X6_50, expected 4X4_50"),
         ("charuco:9x6:25mm:19mm:5X5_50", "chessboard:9x6:25mm", "no ChArUco board found"),
-        ("charuco:5x7:25mm:19mm:5X5_50", "charuco:7x5:25mm:19mm:5X5_50", "arranged differently"),
+        (
+            "charuco:5x7:25mm:19mm:5X5_50",
+            "charuco:7x5:25mm:19mm:5X5_50",
+            "a board of 7x5 squares (or more rows), not 5x7",
+        ),
         ("aprilgrid:4x3:40mm:0.3", "tag:36h11:300:40mm", "found markers with ids 300, expected 0 to 11"),
         ("tag:36h11:5:40mm", "tag:36h11:7:40mm", "found markers with ids 7, expected 5"),
         ("puzzleboard:12x9:20mm", "puzzleboard:12x9:20mm:200x200", "its code does not match"),
