@@ -30,6 +30,7 @@
 
 mod arm_capture;
 mod calibration_images;
+pub mod camera_info;
 pub mod config;
 pub mod dataset;
 pub mod doctor;

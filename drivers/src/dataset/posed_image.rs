@@ -4,7 +4,7 @@ use crate::Error;
 use crate::decode::decode_complete;
 use image::{DynamicImage, ImageReader};
 use kinematics::{Intrinsics, Stamp, Transform};
-use std::io::Read;
+use std::io::{Cursor, Read};
 use std::path::{Path, PathBuf};
 
 /// Maximum size of an image file.
@@ -150,7 +150,9 @@ pub(super) fn image_size_px(path: &Path) -> Result<[u32; 2], Error> {
 
 fn decode_file(path: &Path, max_px: u64) -> Result<DynamicImage, Error> {
     let bytes = files::read(path, MAX_IMAGE_BYTES).map_err(|source| Error::Open { path: path.to_owned(), source })?;
-    let got_px = image_size_px(path)?;
+    let reader = ImageReader::new(Cursor::new(&bytes)).with_guessed_format();
+    let size = reader.map_err(image::ImageError::from).and_then(ImageReader::into_dimensions);
+    let got_px: [u32; 2] = size.map_err(|source| decode_error(path, source))?.into();
     if u64::from(got_px[0]) * u64::from(got_px[1]) > max_px {
         return Err(Error::TooManyPixels { path: path.to_owned(), got_px, max_px });
     }

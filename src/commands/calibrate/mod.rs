@@ -8,7 +8,6 @@ mod json_object;
 mod lens;
 mod outputs;
 mod page;
-mod ros;
 mod scan;
 mod scene;
 mod target;

@@ -3,9 +3,10 @@
 use super::super::images::{self, DetectedImage, ImageFile, OtherSize};
 use super::super::json_object::JsonObject;
 use super::super::lens::LensFile;
-use super::super::{outputs, ros, target_argument};
+use super::super::{outputs, target_argument};
 use crate::exit::{BadArgument, InsufficientData};
 use calibration::hand_eye::{BoardObservation, HandEyeSample, Setup};
+use capture::camera_info;
 use kinematics::{Intrinsics, Transform};
 use nalgebra::DMatrix;
 use serde_json::Value;
@@ -58,7 +59,7 @@ impl SamplesFile {
         let mut value: Value = serde_json::from_str(&text)
             .map_err(|error| BadArgument(format!("{name}: {error}{}", not_json_hint(&text))))?;
         if let Some(intrinsics) = value.get_mut("intrinsics") {
-            ros::convert(intrinsics).map_err(|error| BadArgument(format!("{name}: intrinsics: {error}")))?;
+            camera_info::convert(intrinsics).map_err(|error| BadArgument(format!("{name}: intrinsics: {error}")))?;
         }
         let file = JsonObject::new(&name, String::new(), &value, &FILE_KEYS)?;
         let intrinsics = file.object("intrinsics", &LensFile::KEYS)?;
@@ -173,7 +174,7 @@ fn not_json_hint(text: &str) -> &'static str {
         "; NaN and infinity are not JSON: remove the samples that contain them"
     } else if text.starts_with("%YAML:") {
         "; this is YAML of OpenCV, expected JSON with the keys of docs/guide/calibration.md"
-    } else if ros::is_yaml(text) {
+    } else if camera_info::is_yaml(text) {
         "; this is YAML, expected JSON with the keys of docs/guide/calibration.md. To convert YAML: python3 -c \"import json, sys, yaml; \
          json.dump(yaml.safe_load(sys.stdin), sys.stdout)\" < FILE.yaml > FILE.json"
     } else {

@@ -1,4 +1,4 @@
-//! Lens parameters of ROS.
+//! Lens parameters of ROS, as the JSON keys of samples files.
 //!
 //! Source: `sensor_msgs/CameraInfo`, and the files that `camera_calibration` writes.
 
@@ -11,7 +11,7 @@ use serde_json::{Map, Value, json};
 ///
 /// # Errors
 /// If the values are malformed or have no equivalent.
-pub(super) fn convert(intrinsics: &mut Value) -> Result<(), String> {
+pub fn convert(intrinsics: &mut Value) -> Result<(), String> {
     let Some(object) = intrinsics.as_object() else { return Ok(()) };
     let first = |keys: [&'static str; 3]| keys.into_iter().find_map(|key| Some((key, object.get(key)?)));
     let Some((matrix_key, matrix)) = first(["camera_matrix", "k", "K"]) else { return Ok(()) };
@@ -59,7 +59,7 @@ fn numbers(value: &Value) -> Option<Vec<f64>> {
 }
 
 /// Whether a text is a list of keys in YAML.
-pub(super) fn is_yaml(text: &str) -> bool {
+pub fn is_yaml(text: &str) -> bool {
     let mut lines = text.lines().filter(|line| !line.is_empty() && !line.starts_with(['#', '%']) && *line != "---");
     let is_key = |word: &str| !word.is_empty() && word.chars().all(|c| c.is_ascii_alphanumeric() || "_-".contains(c));
     lines.next().and_then(|line| line.split_once(':')).is_some_and(|(key, _)| is_key(key.trim_start_matches("- ")))
