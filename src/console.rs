@@ -32,6 +32,7 @@ impl OutputMode {
 pub(crate) struct Console {
     output: OutputMode,
     limits: Limits,
+    is_hidden: bool,
     bar: ProgressBar,
 }
 
@@ -42,7 +43,7 @@ impl Console {
         let length = limits.steps.or(limits.seconds.map(whole_secs));
         let template = if length.is_some() { "{bar:30} {elapsed} {msg}" } else { "{spinner} {elapsed} {msg}" };
         let is_hidden = n_sessions > 1 || matches!(output, OutputMode::Json | OutputMode::Nothing);
-        Self { output, limits, bar: print::bar(length, template, is_hidden) }
+        Self { output, limits, is_hidden, bar: print::bar(length, template, is_hidden) }
     }
 }
 
@@ -58,6 +59,16 @@ impl Observer for Console {
                 self.bar.set_message(format!("step {}, {primitives}{psnr}", progress.step));
             }
             (SessionEvent::TrainingEnded, _) => self.bar.finish_and_clear(),
+            (SessionEvent::Scoring { n_scored, n_all }, _) => {
+                if self.bar.is_finished() && n_scored < n_all {
+                    let template = "{bar:30} {elapsed} scored {pos} of {len} test images";
+                    self.bar = print::bar(Some(*n_all as u64), template, self.is_hidden);
+                }
+                self.bar.set_position(*n_scored as u64);
+                if n_scored == n_all {
+                    self.bar.finish_and_clear();
+                }
+            }
             (SessionEvent::Evaluated(evaluation), OutputMode::Json) => print_json(evaluation),
             (SessionEvent::Evaluated(evaluation), OutputMode::Lines) => print::report(format_args!(
                 "{:7.2} s  step {:6}  {:>15}  {:7.2} ms/step  {}",

@@ -25,7 +25,7 @@ fn main() -> ExitCode {
         // New folders get the mode 0700, and new files 0600.
         rustix::process::umask(rustix::fs::Mode::from_raw_mode(0o077));
     }
-    let result = cli.command.run();
+    let result = start_threads().and_then(|()| cli.command.run());
     if let Err(error) = &result
         && !exit::is_broken_pipe(error)
     {
@@ -37,6 +37,14 @@ fn main() -> ExitCode {
         Err(error) if exit::is_broken_pipe(&error) => exit::Exit::Done.into(),
         Err(error) => exit::of(&error).into(),
     }
+}
+
+fn start_threads() -> anyhow::Result<()> {
+    background::start_threads().map_err(|error| {
+        anyhow::anyhow!(
+            "cannot start a thread per processor: {error}; raise the limit on threads (ulimit -u, TasksMax)"
+        )
+    })
 }
 
 /// Suppresses an irrelevant error on machines without a desktop: software Vulkan connects to Wayland, and libwayland

@@ -366,7 +366,12 @@ impl<'a> Runs<'a> {
         }
         let plan = TrainingPlan {
             model_spec,
-            evaluators: Evaluators { during_training, max_images_during_training: usize::MAX, at_end: thorough },
+            evaluators: Evaluators {
+                during_training,
+                max_images_during_training: usize::MAX,
+                max_frac_during_training: None,
+                at_end: thorough,
+            },
             limits: job.limits,
             observer: self.host.observer.training(job.limits),
         };

@@ -3,10 +3,10 @@
 
 use crate::registration::{Alignment, CameraMovement, MovementDetector, align};
 use crate::{CalibratedCamera, CameraCorrection, CameraRefinement, Error};
+use background::{Task, run_in_background_pool};
 use keyframe::Keyframe;
 use kinematics::Stamp;
 use std::sync::Arc;
-use std::thread::JoinHandle;
 
 /// Step at which training waits for the result and applies it. It is smaller on software adapters, where a step takes
 /// as long as alignment.
@@ -32,7 +32,7 @@ enum TaskState {
     /// Alignment can start.
     Requested,
     /// Alignment runs on its own thread.
-    Running(JoinHandle<Option<Alignment>>),
+    Running(Task<Option<Alignment>>),
     /// Alignment has finished or was not requested.
     Done,
 }
@@ -82,8 +82,8 @@ impl AlignmentTask {
             None => keyframe.clone(),
         };
         let keyframes: Vec<_> = keyframes.iter().map(with_movements).collect();
-        self.state =
-            TaskState::Running(std::thread::spawn(move || run_in_background_pool(|| align(&keyframes, &choice))));
+        let work = move || run_in_background_pool(|| align(&keyframes, &choice));
+        self.state = TaskState::Running(Task::start("alignment", work));
     }
 
     /// Waits for the result. Returns whether these keyframes must be corrected differently than before. If alignment
@@ -166,7 +166,7 @@ enum Worker {
     /// The detector has not yet been created from its reference keyframes.
     New(Vec<Arc<Keyframe>>),
     Idle(MovementDetector),
-    Running(JoinHandle<(MovementDetector, Option<CameraMovement>)>),
+    Running(Task<(MovementDetector, Option<CameraMovement>)>),
     /// A movement was found.
     Done,
 }
@@ -199,7 +199,7 @@ impl MovementTask {
             let movement = keyframes.iter().find_map(|keyframe| detector.push(keyframe));
             (detector, movement)
         };
-        self.worker = Worker::Running(std::thread::spawn(|| run_in_background_pool(test)));
+        self.worker = Worker::Running(Task::start("movement", || run_in_background_pool(test)));
     }
 
     /// Returns a movement if one was found. With `wait`, tests all keyframes first.
@@ -222,15 +222,5 @@ impl MovementTask {
                 }
             }
         }
-    }
-}
-
-/// Runs `work` in a separate thread pool. In the global pool, training, which downscales images on all processors,
-/// would wait for it.
-pub fn run_in_background_pool<T: Send>(work: impl FnOnce() -> T + Send) -> T {
-    let n_processors = std::thread::available_parallelism().map_or(1, usize::from);
-    match rayon::ThreadPoolBuilder::new().num_threads((3 * n_processors).div_ceil(4)).build() {
-        Ok(pool) => pool.install(work),
-        Err(_) => work(),
     }
 }

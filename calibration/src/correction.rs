@@ -7,7 +7,7 @@ use std::collections::BTreeMap;
 
 /// Estimated calibration correction of one camera.
 #[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
-#[serde(default)]
+#[serde(default, deny_unknown_fields)]
 pub struct CameraCorrection {
     /// Rotation vector in the camera's own axes, radians. The rotation, then the translation, are applied after
     /// `camera_from_world`.

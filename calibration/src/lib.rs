@@ -41,7 +41,7 @@ mod tag_check;
 pub mod time_offset;
 mod trial;
 
-pub use background::{AlignmentTask, MovementTask, alignment_step, run_in_background_pool};
+pub use background::{AlignmentTask, MovementTask, alignment_step};
 pub use board::{BoardPoint, BoardView};
 pub use correction::{
     CalibratedCamera, CameraCorrection, EMBEDDING_DIM, drift_weight, interpolate, rigid_transform, shares_lens,

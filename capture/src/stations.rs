@@ -8,13 +8,13 @@
 
 use crate::config::{BaseDriver, Parent, Rig};
 use crate::join::Change;
-use calibration::{StationCorrection, register_station, run_in_background_pool};
+use background::{Task, run_in_background_pool};
+use calibration::{StationCorrection, register_station};
 use keyframe::{BaseState, Keyframe, Split};
 use kinematics::{Stamp, Transform};
 use serde::Serialize;
 use std::collections::{BTreeSet, VecDeque};
 use std::sync::Arc;
-use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 /// Number of keyframes with depth, excluding test keyframes, with which a station is registered. A scan of a few
@@ -49,7 +49,7 @@ pub struct Stations {
     held: Vec<Change>,
     /// Changes received since registration of the next station started.
     queue: VecDeque<Change>,
-    search: Option<JoinHandle<SearchResult>>,
+    search: Option<Task<SearchResult>>,
     reported: Vec<StationReport>,
     /// Total time spent on registration.
     spent: Duration,
@@ -294,7 +294,7 @@ impl Stations {
             .collect();
         let (reference_keyframes, world_from_base) =
             (self.reference_keyframes.clone(), guess * base_state.world_from_base);
-        self.search = Some(std::thread::spawn(move || {
+        self.search = Some(Task::start("station", move || {
             let started = Instant::now();
             let correction = run_in_background_pool(|| register_station(&reference_keyframes, &new, &world_from_base));
             SearchResult { correction, took: started.elapsed() }

@@ -4,12 +4,16 @@
 //! - Whole files are written under a temporary name and then renamed, so that they are complete or absent. [`begin`] is the
 //!   exception: it starts a growing log under its final name.
 //! - Symbolic links are followed when reading, but neither the temporary nor the final name of an output is followed.
+//! - Files and folders that are in use are [`Kept`]: it is noticed if somebody removes or renames them, and their contents
+//!   are written again.
 //! - Of two programs that write the same file at the same time, the second gets an error, if the file system supports
 //!   locks.
 
+mod kept;
 pub mod partial;
 mod reading;
 mod writing;
 
+pub use kept::{Kept, Place};
 pub use reading::{MAX_TEXT_BYTES, NO_LIMIT, open, read, read_text};
 pub use writing::{begin, check_no_link, create, create_from, lock, replace, write};

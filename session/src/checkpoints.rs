@@ -4,11 +4,11 @@ use crate::Error;
 use crate::error::Context;
 use crate::run_folder::{CHECKPOINT, expect_one_model};
 use crate::stored_keyframes::StoredKeyframes;
+use background::Task;
 use keyframe::Keyframe;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 use trainer::checkpoint::{Checkpoint, PendingCheckpoint};
 use trainer::{Edits, Method, ModelKind};
@@ -101,7 +101,7 @@ pub struct Checkpoints {
 
 /// A writer thread.
 struct WriterThread {
-    thread: JoinHandle<crate::Result<()>>,
+    thread: Task<crate::Result<()>>,
     /// `true` if it writes a checkpoint, `false` if it writes only keyframes.
     is_checkpoint: bool,
 }
@@ -169,7 +169,7 @@ impl Checkpoints {
         {
             self.wait_and_warn();
             let keyframes = now.keyframes.to_vec();
-            let thread = std::thread::spawn(move || stored.add(&keyframes));
+            let thread = Task::start("keyframes", move || stored.add(&keyframes));
             self.writer = Some(WriterThread { thread, is_checkpoint: false });
             self.last_keyframes = Instant::now();
         }
@@ -207,7 +207,7 @@ impl Checkpoints {
 
     /// Writes a copy on a separate thread.
     pub fn write(&mut self, job: CheckpointWrite) {
-        let thread = std::thread::spawn(move || job.write());
+        let thread = Task::start("checkpoint", move || job.write());
         self.writer = Some(WriterThread { thread, is_checkpoint: true });
         (self.last, self.last_keyframes) = (Instant::now(), Instant::now());
         self.due_after = self.period;

@@ -1,8 +1,8 @@
 //! Publishes the chunks of models that clients draw themselves, without delaying training.
 
+use background::Task;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
-use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 use trainer::{Edits, Error, Method, ModelChunks, ModelKind};
 use viz::Hub;
@@ -27,7 +27,7 @@ pub(crate) struct ChunkPublisher {
 struct Encoding {
     name: &'static str,
     began: Instant,
-    thread: JoinHandle<Result<ModelChunks, Error>>,
+    thread: Task<Result<ModelChunks, Error>>,
 }
 
 /// The last published version of a model.
@@ -72,7 +72,7 @@ impl ChunkPublisher {
         match method.queue_chunks(only_changed, edits) {
             Ok(None) => {}
             Ok(Some(pending)) => {
-                self.task = Some(Encoding { name, began, thread: std::thread::spawn(|| pending.finish()) });
+                self.task = Some(Encoding { name, began, thread: Task::start("chunks", || pending.finish()) });
             }
             Err(error) => self.fail(name, &error.to_string()),
         }

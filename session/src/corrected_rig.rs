@@ -190,7 +190,12 @@ pub fn write(rig: &Rig, file: &Path) -> crate::Result<()> {
         let copy = |backup: &mut std::fs::File| std::io::copy(&mut files::open(file)?, backup).map(drop);
         files::create(&unused_backup(file), copy).with_context(in_file)?;
     }
-    run_folder::write_atomic(file, &rig.to_toml()).with_context(in_file)
+    let linked = std::fs::read_link(file);
+    run_folder::write_atomic(file, &rig.to_toml()).with_context(in_file)?;
+    if let Ok(target) = linked {
+        log::warn!("{} was a symbolic link: it is a file now, and {} is unchanged", file.display(), target.display());
+    }
+    Ok(())
 }
 
 /// Path of a backup that does not exist yet.

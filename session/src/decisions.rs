@@ -223,6 +223,8 @@ enum Activity {
 pub struct DecisionLog {
     sender: SyncSender<Line>,
     thread: JoinHandle<std::io::Result<()>>,
+    /// The file, which somebody may remove while it is written; `None` if it cannot be watched.
+    kept: Option<files::Kept>,
     last_step: Option<u64>,
     activity: Activity,
 }
@@ -251,7 +253,8 @@ impl DecisionLog {
             lines.into_iter().try_for_each(|line: Line| file.write_all(line.text()?.as_bytes()))
         });
         let thread = thread.context("cannot start a thread")?;
-        let mut log = Self { sender, thread, last_step: None, activity: Activity::Nothing };
+        let kept = files::Kept::open(&path).ok();
+        let mut log = Self { sender, thread, kept, last_step: None, activity: Activity::Nothing };
         log.write(Line::Settings(Box::new(settings)));
         Ok(log)
     }
@@ -320,7 +323,11 @@ impl DecisionLog {
         self.write(Line::Entry(Entry { step, decision: Decision::End(True) }));
         drop(self.sender);
         let written = self.thread.join().map_err(|_| Error::Failed("the log thread panicked: this is a bug".into()))?;
-        written.context("the decision log is incomplete")
+        written.context("the decision log is incomplete")?;
+        match self.kept.filter(|kept| kept.place() != files::Place::Here) {
+            Some(kept) => kept.restore().with_context(|| format!("cannot write {} again", kept.path().display())),
+            None => Ok(()),
+        }
     }
 
     /// Closes the log without an end, as if the run had been killed. All decisions so far are written when this

@@ -1,7 +1,7 @@
 //! Applies the edits that operators request.
 
+use background::Task;
 use std::sync::Arc;
-use std::thread::JoinHandle;
 use trainer::edits::{Edit, Edits, Floaters, PendingFloaters};
 use trainer::{Error, Method};
 use viz::{EditAction, EditRequest};
@@ -16,7 +16,7 @@ pub(crate) struct Editor {
 /// A search for floaters.
 struct Search {
     request: EditRequest,
-    thread: JoinHandle<Result<Floaters, Error>>,
+    thread: Task<Result<Floaters, Error>>,
 }
 
 impl Editor {
@@ -48,7 +48,7 @@ impl Editor {
     }
 
     fn start(&mut self, request: EditRequest, pending: PendingFloaters) {
-        self.search = Some(Search { request, thread: std::thread::spawn(|| pending.finish()) });
+        self.search = Some(Search { request, thread: Task::start("floaters", || pending.finish()) });
     }
 
     /// A note on the search that is running.

@@ -6,11 +6,14 @@ use crate::error::Context;
 use calibration::CalibratedCamera;
 use keyframe::{DepthMap, Keyframe, counted};
 use serde::Serialize;
+use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::fmt::{Display, Formatter};
+use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use trainer::eval::{Lpips, PixelPair, SurfaceError, depth_rmse_m, psnr, ssim, surface_error};
+use std::time::Duration;
+use trainer::eval::{Lpips, PixelPair, depth_rmse_m, psnr, ssim, surface_error};
 use trainer::{Method, Picture, Projection, RenderRequest};
 
 /// Environment variable with the path of the LPIPS weights, used if the flag is not given.
@@ -19,6 +22,9 @@ const LPIPS_WEIGHTS: &str = "FIELDRIG_LPIPS_WEIGHTS";
 const NEAR_M: f64 = 0.01;
 /// Far plane of renders, meters.
 const FAR_M: f64 = 1000.0;
+
+/// How long [`Evaluator::score_all`] waits for scores before it calls `meanwhile` again.
+const MEANWHILE_PERIOD: Duration = Duration::from_millis(5);
 
 /// Minimum alpha of a pixel that counts as covered by the model.
 pub const MIN_ALPHA: u8 = 128;
@@ -115,6 +121,12 @@ impl Evaluator {
         Ok(Self { is_full: true, lpips: load_lpips(lpips_weights)?.map(Arc::new) })
     }
 
+    /// The same scores except LPIPS, which takes seconds per image.
+    #[must_use]
+    pub fn without_lpips(&self) -> Self {
+        Self { lpips: None, ..self.clone() }
+    }
+
     /// Computes PSNR only, with one render per image.
     pub fn psnr_only() -> Self {
         Self { is_full: false, lpips: None }
@@ -140,37 +152,106 @@ impl Evaluator {
                 covered_frac: None,
             });
         }
-        let drawn = draw(method, keyframe, false)?;
-        let pair = PixelPair::new(keyframe.size_px, &drawn.rgba_srgb, &keyframe.rgba_srgb)?;
-        let depth = if self.is_full { depth_error(method, keyframe)? } else { DepthError::default() };
-        Ok(ImageScores {
-            camera: keyframe.camera.to_string(),
-            stamp_nanos: keyframe.stamp.0,
-            psnr: psnr(&pair)?,
-            ssim: self.is_full.then(|| ssim(&pair)).transpose()?,
-            lpips: self.lpips.as_ref().map(|lpips| lpips.distance(&pair)).transpose()?,
-            depth_rmse_m: depth.rmse_m,
-            surface_error_m: depth.surface.and_then(|surface| surface.mean_m),
-            surface_within_5_mm: depth.surface.map(|surface| surface.near_frac),
-            psnr_truth: if self.is_full { truth_score(method, keyframe)? } else { None },
-            psnr_ceiling: keyframe.truth.as_ref().and_then(|truth| truth.psnr_ceiling),
-            covered_frac: Some(covered_frac(&drawn)),
-        })
+        self.draw(method, keyframe)?.scores(self)
     }
 
     /// Scores one test keyframe. Errors name the keyframe.
     pub fn score_named(&self, method: &mut dyn Method, keyframe: &Keyframe) -> crate::Result<ImageScores> {
-        self.score(method, keyframe)
-            .with_context(|| format!("test image of {:?} at {} ns", keyframe.camera, keyframe.stamp.0))
+        self.score(method, keyframe).with_context(|| name_of(keyframe))
     }
 
-    /// Scores test keyframes one after the other.
+    /// Scores test keyframes: while some are scored on the CPU, the next ones are rendered. The result has the order of
+    /// `tests`.
+    ///
+    /// * `meanwhile`: called often, with the number of scored keyframes, also while no render is due.
     pub fn score_all<'a>(
         &self,
         method: &mut dyn Method,
         tests: impl Iterator<Item = &'a Arc<Keyframe>>,
+        mut meanwhile: impl FnMut(&mut dyn Method, usize),
     ) -> crate::Result<Vec<ImageScores>> {
-        tests.map(|keyframe| self.score_named(method, keyframe)).collect()
+        let max_waiting = 2 * rayon::current_num_threads();
+        let (sender, receiver) = std::sync::mpsc::channel();
+        let mut scored: Vec<(usize, ImageScores)> = Vec::new();
+        let all: crate::Result<()> = rayon::in_place_scope(|scope| {
+            let mut n_drawn = 0;
+            let mut tests = tests.fuse();
+            loop {
+                let next = if n_drawn - scored.len() < max_waiting { tests.next() } else { None };
+                if let Some(keyframe) = next {
+                    let drawn = self.draw(method, keyframe).with_context(|| name_of(keyframe))?;
+                    let (ix, sender) = (n_drawn, sender.clone());
+                    scope.spawn(move |_| {
+                        let scores = catch_unwind(AssertUnwindSafe(|| drawn.scores(self)));
+                        // Nobody waits after an error of another keyframe.
+                        let _ = sender.send((ix, keyframe, scores));
+                    });
+                    n_drawn += 1;
+                } else if scored.len() == n_drawn {
+                    return Ok(());
+                }
+                let wait = if next.is_some() { Duration::ZERO } else { MEANWHILE_PERIOD };
+                if let Ok((ix, keyframe, scores)) = receiver.recv_timeout(wait) {
+                    let scores = scores.unwrap_or_else(|panic| resume_unwind(panic));
+                    scored.push((ix, scores.with_context(|| name_of(keyframe))?));
+                }
+                meanwhile(method, scored.len());
+            }
+        });
+        all?;
+        scored.sort_by_key(|(ix, _)| *ix);
+        Ok(scored.into_iter().map(|(_, scores)| scores).collect())
+    }
+
+    /// Renders what the scores of a keyframe need.
+    fn draw<'a>(&self, method: &mut dyn Method, keyframe: &'a Keyframe) -> crate::Result<Drawn<'a>> {
+        let (depth, at_truth) = match self.is_full {
+            true => (draw_depth(method, keyframe)?, draw_at_truth(method, keyframe)?),
+            false => (None, None),
+        };
+        Ok(Drawn { keyframe, picture: draw(method, keyframe, false)?, depth, at_truth })
+    }
+}
+
+fn name_of(keyframe: &Keyframe) -> String {
+    format!("test image of {:?} at {} ns", keyframe.camera, keyframe.stamp.0)
+}
+
+/// The renders from which the scores of a test keyframe are computed.
+struct Drawn<'a> {
+    keyframe: &'a Keyframe,
+    picture: Picture,
+    /// Rendered depth, and the measured depth at its size.
+    depth: Option<(Picture, Cow<'a, DepthMap>)>,
+    /// A render at the true pose.
+    at_truth: Option<Picture>,
+}
+
+impl Drawn<'_> {
+    /// Computes the scores, without the GPU.
+    fn scores(&self, evaluator: &Evaluator) -> crate::Result<ImageScores> {
+        let Self { keyframe, picture, depth, at_truth } = self;
+        let pair = PixelPair::new(keyframe.size_px, &picture.rgba_srgb, &keyframe.rgba_srgb)?;
+        let rmse_m = depth.as_ref().map(|(drawn, depth)| depth_rmse_m(&drawn.depth_m, &depth.depth_m));
+        let surface = depth.as_ref().map(|(drawn, depth)| surface_error(&drawn.depth_m, depth)).transpose()?.flatten();
+        let truth = keyframe.truth.as_ref();
+        let psnr_truth = at_truth
+            .as_ref()
+            .zip(truth)
+            .map(|(drawn, truth)| psnr(&PixelPair::new(keyframe.size_px, &drawn.rgba_srgb, &truth.rgba_srgb)?));
+        Ok(ImageScores {
+            camera: keyframe.camera.to_string(),
+            stamp_nanos: keyframe.stamp.0,
+            psnr: psnr(&pair)?,
+            ssim: evaluator.is_full.then(|| ssim(&pair)).transpose()?,
+            lpips: evaluator.lpips.as_ref().map(|lpips| lpips.distance(&pair)).transpose()?,
+            depth_rmse_m: rmse_m.transpose()?.flatten(),
+            surface_error_m: surface.and_then(|surface| surface.mean_m),
+            surface_within_5_mm: surface.map(|surface| surface.near_frac),
+            psnr_truth: psnr_truth.transpose()?,
+            psnr_ceiling: truth.and_then(|truth| truth.psnr_ceiling),
+            covered_frac: Some(covered_frac(picture)),
+        })
     }
 }
 
@@ -313,33 +394,23 @@ fn request(keyframe: &Keyframe, lens: &CalibratedCamera) -> RenderRequest {
     }
 }
 
-/// Errors of rendered depth, compared with measured depth.
-#[derive(Default)]
-struct DepthError {
-    rmse_m: Option<f64>,
-    surface: Option<SurfaceError>,
-}
-
-fn depth_error(method: &mut dyn Method, keyframe: &Keyframe) -> crate::Result<DepthError> {
-    let Some(full) = &keyframe.depth else { return Ok(DepthError::default()) };
+/// Renders depth at the size at which the method can be compared with the measured depth.
+fn draw_depth<'a>(
+    method: &mut dyn Method,
+    keyframe: &'a Keyframe,
+) -> crate::Result<Option<(Picture, Cow<'a, DepthMap>)>> {
+    let Some(full) = &keyframe.depth else { return Ok(None) };
     let stride = method.depth_stride();
-    let subsampled = (stride > 1).then(|| full.subsampled(stride));
-    let depth = subsampled.as_ref().unwrap_or(full);
-    let Some(drawn) = render_depth(method, keyframe, depth)? else { return Ok(DepthError::default()) };
-    Ok(DepthError {
-        rmse_m: depth_rmse_m(&drawn.depth_m, &depth.depth_m)?,
-        surface: surface_error(&drawn.depth_m, depth)?,
-    })
+    let depth = if stride > 1 { Cow::Owned(full.subsampled(stride)) } else { Cow::Borrowed(full) };
+    Ok(render_depth(method, keyframe, &depth)?.map(|drawn| (drawn, depth)))
 }
 
-/// PSNR of a render at the true pose against the noise-free image, which has no rolling shutter.
-fn truth_score(method: &mut dyn Method, keyframe: &Keyframe) -> crate::Result<Option<f64>> {
+/// Renders at the true pose, for the comparison with the noise-free image, which has no rolling shutter.
+fn draw_at_truth(method: &mut dyn Method, keyframe: &Keyframe) -> crate::Result<Option<Picture>> {
     let Some(truth) = &keyframe.truth else { return Ok(None) };
     let lens = CalibratedCamera { world_from_camera: truth.world_from_camera, ..method.calibrated_camera(keyframe)? };
     let background_srgb = method.background_srgb();
-    let at_truth = RenderRequest { shutter: None, background_srgb, ..request(keyframe, &lens) };
-    let drawn = method.render(&at_truth)?;
-    Ok(Some(psnr(&PixelPair::new(keyframe.size_px, &drawn.rgba_srgb, &truth.rgba_srgb)?)?))
+    Ok(Some(method.render(&RenderRequest { shutter: None, background_srgb, ..request(keyframe, &lens) })?))
 }
 
 #[cfg(test)]

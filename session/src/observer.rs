@@ -25,6 +25,13 @@ pub enum SessionEvent<'a> {
     Evaluated(&'a Evaluation),
     /// Training ended; saving and scoring follow.
     TrainingEnded,
+    /// The saved model is being scored.
+    Scoring {
+        /// Number of test images scored so far.
+        n_scored: usize,
+        /// Number of test images.
+        n_all: usize,
+    },
     /// The model was saved and scored.
     Finished(&'a FinishedReport<'a>),
 }

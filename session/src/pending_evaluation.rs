@@ -6,10 +6,6 @@ use std::collections::VecDeque;
 use std::sync::Arc;
 use std::time::Duration;
 
-/// Time limit for scoring. Fewer images are scored if rendering is slow: on a CPU, a neural field takes seconds per
-/// image.
-const MAX_SCORING: Duration = Duration::from_secs(60);
-
 /// An evaluation in progress.
 pub(crate) struct PendingEvaluation {
     /// Training time at which the evaluation was due, seconds.
@@ -18,25 +14,29 @@ pub(crate) struct PendingEvaluation {
     remaining: VecDeque<Arc<Keyframe>>,
     images: Vec<ImageScores>,
     spent: Duration,
+    /// Time limit for scoring. One image is scored in any case.
+    max_spent: Duration,
 }
 
 impl PendingEvaluation {
-    /// An evaluation due at `seconds` that scores at most `max_images` of the test keyframes.
+    /// An evaluation due at `seconds` that scores at most `max_images` of the test keyframes, and fewer if `max_spent` is
+    /// over before: on a CPU, rendering a neural field takes seconds per image.
     pub(crate) fn new<'a>(
         seconds: f64,
         tests: impl ExactSizeIterator<Item = &'a Arc<Keyframe>>,
         max_images: usize,
+        max_spent: Duration,
     ) -> Self {
         let stride = tests.len().div_ceil(max_images).max(1);
         let mut selected: Vec<(usize, &Arc<Keyframe>)> = tests.step_by(stride).enumerate().collect();
         selected.sort_by_key(|(ix, _)| ix.reverse_bits());
         let remaining = selected.into_iter().map(|(_, keyframe)| keyframe.clone()).collect();
-        Self { seconds, remaining, images: Vec::new(), spent: Duration::ZERO }
+        Self { seconds, remaining, images: Vec::new(), spent: Duration::ZERO, max_spent }
     }
 
     /// The next test keyframe to score; `None` if all are scored or the time limit is reached.
     pub(crate) fn take_next(&mut self) -> Option<Arc<Keyframe>> {
-        if self.spent < MAX_SCORING { self.remaining.pop_front() } else { None }
+        if self.is_complete() { None } else { self.remaining.pop_front() }
     }
 
     /// Adds the scores of the last keyframe and the time that scoring took.
@@ -47,7 +47,12 @@ impl PendingEvaluation {
 
     /// Whether no image is left to score.
     pub(crate) fn is_complete(&self) -> bool {
-        self.remaining.is_empty() || self.spent >= MAX_SCORING
+        self.remaining.is_empty() || !self.images.is_empty() && self.spent >= self.max_spent
+    }
+
+    /// The time that scoring has taken.
+    pub(crate) fn spent(&self) -> Duration {
+        self.spent
     }
 
     /// The scores so far.

@@ -259,7 +259,7 @@ fn make_in(parent: &Path, prefix: &str) -> crate::Result<PathBuf> {
 
 /// Locks a folder against other runs for the lifetime of this process. A folder whose subfolders are links is rejected: it
 /// may come from somebody else, and files written through its links would replace other files.
-fn lock(folder: &Path) -> crate::Result<()> {
+pub(crate) fn lock(folder: &Path) -> crate::Result<()> {
     let of_methods = ModelKind::ALL.iter().map(|kind| kind.name());
     for subfolder in [PARTIAL_MODEL, KEYFRAMES].into_iter().chain(of_methods) {
         files::check_no_link(&folder.join(subfolder)).map_err(|link| Error::BadInput(link.to_string()))?;

@@ -20,6 +20,7 @@ use crate::decisions::DecisionLog;
 use crate::editing::{self, Editor};
 use crate::evaluate::Evaluator;
 use crate::gpu_loss;
+use crate::kept_folder::KeptFolder;
 use crate::next_commands::DataSource;
 use crate::observer::{Evaluation, Observer};
 use crate::recovery::Recovery;
@@ -127,6 +128,18 @@ impl Session {
     pub fn with_data(mut self, data: DataSource) -> Self {
         self.reporter.set_data(data);
         self
+    }
+
+    /// Makes these folders of the run again if somebody removes or renames them.
+    #[must_use]
+    pub fn with_folders(mut self, folders: Vec<KeptFolder>) -> Self {
+        self.persistence.set_folders(folders);
+        self
+    }
+
+    /// Makes the folders of the run again if they have disappeared.
+    pub fn check_folders(&mut self) {
+        self.persistence.check_folders();
     }
 
     /// Enables recovery on another device if the GPU fails.
@@ -467,6 +480,7 @@ impl Session {
 
     /// Writes a checkpoint, or the new keyframes, if they are due.
     pub(crate) fn write_checkpoint_when_due(&mut self) -> crate::Result<()> {
+        self.persistence.check_folders_when_due();
         let seconds = self.secs();
         let (method, keyframes, edits) = (self.method.as_mut(), &self.keyframes[..], &*self.edits);
         self.persistence.write_checkpoint_when_due(Snapshot { method, keyframes, edits, seconds, is_finished: false })
@@ -507,6 +521,7 @@ impl Session {
             evaluation.add(scores, before.elapsed());
         }
         if evaluation.is_complete() {
+            self.scoreboard.add_spent(evaluation.spent());
             let (seconds, images) = (evaluation.seconds, evaluation.into_images());
             self.scoreboard.record(&images, self.secs());
             self.reporter.report_evaluation(seconds, &images, self.progress());

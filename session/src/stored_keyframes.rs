@@ -92,13 +92,29 @@ impl StoredKeyframes {
         Ok(())
     }
 
-    /// Reads all keyframes, ordered by stamp.
+    /// Reads all keyframes, ordered by stamp. Those that cannot be read are left out, each with a warning.
+    ///
+    /// # Errors
+    ///
+    /// Fails if the folder cannot be listed, or if none of its keyframes can be read.
     pub fn read(&self) -> crate::Result<Vec<Arc<Keyframe>>> {
-        let mut keyframes = Vec::new();
-        for name in self.names()? {
+        let names = self.names()?;
+        let (mut keyframes, mut errors) = (Vec::new(), Vec::new());
+        for name in &names {
             let path = self.folder.join(name);
             let read = || keyframe_of(&Checkpoint::read(&path)?);
-            keyframes.push(Arc::new(read().with_context(|| format!("cannot read the keyframe {}", path.display()))?));
+            match read().with_context(|| format!("cannot read the keyframe {}", path.display())) {
+                Ok(keyframe) => keyframes.push(Arc::new(keyframe)),
+                Err(error) => errors.push(error),
+            }
+        }
+        if keyframes.is_empty()
+            && let Some(error) = errors.pop()
+        {
+            return Err(error);
+        }
+        for error in errors {
+            log::warn!("{error:#}; the run continues without it");
         }
         keyframes.sort_by(|one, other| (one.stamp, &one.camera).cmp(&(other.stamp, &other.camera)));
         Ok(keyframes)
@@ -290,7 +306,7 @@ mod tests {
     }
 
     #[test]
-    fn damaged_file_is_named_in_the_error() {
+    fn damaged_files_are_left_out_and_named() {
         let run = tempfile::tempdir().expect("a folder");
         let stored = StoredKeyframes::of_run(run.path());
         assert!(stored.read().is_err(), "no folder yet");
@@ -302,5 +318,9 @@ mod tests {
         std::fs::write(&path, bytes).expect("disk space");
         let message = format!("{:#}", stored.read().expect_err("damaged"));
         assert!(message.contains("wrist_00000000000000000001.keyframe") && message.contains("damaged"), "{message}");
+        stored.add(&[keyframe(2, true), keyframe(3, false)]).expect("disk space");
+        std::fs::write(run.path().join(KEYFRAMES).join("wrist_00000000000000000003.keyframe"), "").expect("disk space");
+        let stamps: Vec<i64> = stored.read().expect("one is readable").iter().map(|read| read.stamp.0).collect();
+        assert_eq!(stamps, [2], "the others are left out");
     }
 }

@@ -182,15 +182,25 @@ impl ModelViewer {
             Ok(model) => model,
             Err(reason) => return pending.fail(&reason),
         };
-        let request = RenderRequest { edits: Arc::clone(&model.edits), ..request };
-        let rendered = match pending.packing() {
-            Some(packing) => model.method.render_packed(&request, packing),
-            None => model.method.render(&request).map(Rendered::Picture),
-        };
-        match rendered {
-            Ok(picture) => pending.deliver(picture),
-            Err(error) => pending.fail(&error.to_string()),
-        }
+        answer_with(pending, request, model.method.as_mut(), &model.edits);
+    }
+}
+
+/// Draws a requested picture of a model whose frame is the world frame of the page.
+pub(crate) fn answer(pending: PendingRender, method: &mut dyn Method, edits: &Arc<Edits>) {
+    let request = pending.request.clone();
+    answer_with(pending, request, method, edits);
+}
+
+fn answer_with(pending: PendingRender, request: RenderRequest, method: &mut dyn Method, edits: &Arc<Edits>) {
+    let request = RenderRequest { edits: Arc::clone(edits), ..request };
+    let rendered = match pending.packing() {
+        Some(packing) => method.render_packed(&request, packing),
+        None => method.render(&request).map(Rendered::Picture),
+    };
+    match rendered {
+        Ok(picture) => pending.deliver(picture),
+        Err(error) => pending.fail(&error.to_string()),
     }
 }
 

@@ -65,7 +65,10 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
             "the model was trained with another rig file, and its camera corrections apply to that file; see --rig"
         );
     }
-    let images = evaluator.score_all(model.as_mut(), tests.iter())?;
+    let scored = print::bar(Some(tests.len() as u64), "{bar:30} {elapsed} scored {pos} of {len} images", args.json);
+    let images =
+        evaluator.score_all(model.as_mut(), tests.iter(), |_, n_scored| scored.set_position(n_scored as u64))?;
+    scored.finish_and_clear();
     warn_if_hardly_covered(&images.iter().filter_map(|image| image.covered_frac).collect::<Vec<_>>());
     let scores = Scores::mean(&images);
     let is_test = |keyframe: &Keyframe| keyframe.split == Split::Test;

@@ -25,8 +25,8 @@ use session::methods::{self, COUNT};
 use session::next_commands::{DataSource, quoted};
 use session::run_folder::{self, CreatedFolders};
 use session::{
-    AvailableData, Checkpoints, Clock, DecisionLog, EndingSession, Evaluator, Evaluators, FinishedModel, Latency,
-    Limits, Live, LiveOptions, ModelViewer, Pace, REALIGN, Recovery, RefineSettings, RunDescription, RunFlags,
+    AvailableData, Checkpoints, Clock, DecisionLog, EndingSession, Evaluator, Evaluators, FinishedModel, KeptFolder,
+    Latency, Limits, Live, LiveOptions, ModelViewer, Pace, REALIGN, Recovery, RefineSettings, RunDescription, RunFlags,
     ServedModel, Session, Settings, StoredKeyframes, Viewers, checkpoints, corrected_rig, methods_of, recovery,
     robot_meshes,
 };
@@ -122,6 +122,8 @@ const RECORD: &str = "record";
 const FINAL_STATUS_TIME: Duration = Duration::from_millis(400);
 /// Steps between two keyframes if the flag is not given.
 const DEFAULT_STEPS_PER_KEYFRAME: u64 = 10;
+/// Maximum time of the scheduled evaluations, as a fraction of the training time.
+const MAX_EVALUATION_FRAC: f64 = 0.1;
 /// Keyframes wait during an evaluation, so it must be short, especially on a software adapter.
 const MAX_IMAGES_SCORED_LIVE: usize = 12;
 const MAX_IMAGES_SCORED_LIVE_ON_CPU: usize = 4;
@@ -326,7 +328,7 @@ pub(super) fn start(
         ..common
     };
     let mut models: Vec<Resumed> = match previous {
-        Some(previous) => vec![trainer::resume(gpu.clone(), &previous.checkpoint, &previous.keyframes)?],
+        Some(previous) => vec![previous.resume(&gpu)?],
         None => {
             let start = |model_spec: ModelSpec| {
                 let method = model_spec.start(gpu.clone())?;
@@ -360,6 +362,7 @@ pub(super) fn start(
             true => MAX_IMAGES_SCORED_LIVE_ON_CPU,
             false => MAX_IMAGES_SCORED_LIVE,
         },
+        max_frac_during_training: Some(MAX_EVALUATION_FRAC),
         at_end: Evaluator::thorough(None)?,
     };
     let limits = Limits { seconds: args.seconds, steps: args.steps };
@@ -402,6 +405,7 @@ pub(super) fn start(
             .with_checkpoints(checkpoints.map(|to| to.with_flags(run_flags).with_keyframes(folder)))
             .with_decisions(decisions)
             .with_data(args.data_source(folder))
+            .with_folders(KeptFolder::of_run(folder, kinds.len() > 1))
             .with_recovery(recovery);
         let mut session = match previous {
             Some(previous) => session.with_elapsed_secs(previous.checkpoint.seconds),
@@ -462,6 +466,7 @@ fn save(
     let recoverable = live.describe_recoverable();
     let mut latencies = live.ledger().latencies();
     let (mut sessions, input_result) = live.finish();
+    sessions.iter_mut().for_each(Session::check_folders);
     let input_result = match input_result {
         Ok(input_result) => input_result,
         Err(error) => {
@@ -469,7 +474,7 @@ fn save(
             let details = || serde_json::json!({ "data_losses": [error.to_string()] });
             let ending = |(session, out): (Session, PathBuf)| EndingSession { details: details(), session, out };
             if n_train > 0 {
-                session::finish(sessions.into_iter().zip(folders).map(ending).collect())?;
+                session::finish(sessions.into_iter().zip(folders).map(ending).collect(), Some(&hub))?;
             }
             return Err(error.into());
         }
@@ -487,7 +492,8 @@ fn save(
         SampleUse::ProcessedOnly
     });
     // An incomplete recording cannot be used to score the model later.
-    let is_recorded = input_result.recording_error.is_none();
+    let is_moved = args.record.as_ref().is_some_and(|file| !file.exists());
+    let is_recorded = input_result.recording_error.is_none() && !is_moved;
     data_losses.extend(input_result.recording_error.map(|error| format!("the recording is incomplete: {error:#}")));
     data_losses.extend(damage.get().cloned());
     let corrected = corrected_rigs(rig, &mut sessions, &folders);
@@ -512,7 +518,7 @@ fn save(
     };
     let mut models = Vec::new();
     if n_train > 0 {
-        let finished = session::finish(sessions.into_iter().zip(folders).map(&mut ending).collect());
+        let finished = session::finish(sessions.into_iter().zip(folders).map(&mut ending).collect(), Some(&hub));
         models = finished.map_err(|error| recovery::with_recoverable(error, &recoverable))?;
         if !args.json {
             print_next_commands(&models);
@@ -574,6 +580,21 @@ impl PreviousRun {
             counted(keyframes.len() as u64, "keyframe")
         );
         Ok(Self { folder: folder.to_owned(), checkpoint, keyframes })
+    }
+
+    /// Restores its model, without the keyframes that cannot be read.
+    fn resume(&self, gpu: &Arc<Gpu>) -> anyhow::Result<Resumed> {
+        let (resumed, missing) = trainer::resume_without_missing(gpu.clone(), &self.checkpoint, &self.keyframes)?;
+        if let Some((camera, stamp)) = missing.first() {
+            log::warn!(
+                "{} of that run {} missing, the first of camera {camera:?} at {} ns: the model keeps what it has learned \
+                 from them, but is no longer trained on them",
+                counted(missing.len() as u64, "keyframe"),
+                if missing.len() == 1 { "is" } else { "are" },
+                stamp.0
+            );
+        }
+        Ok(resumed)
     }
 
     /// Rig file settings that flags of that run have changed.

@@ -15,8 +15,8 @@ use session::depth_from::{self, DepthSource, RenderedDepth};
 use session::next_commands::{DataSource, quoted};
 use session::run_folder::{self, CreatedFolders};
 use session::{
-    Checkpoints, Clock, Data, DecisionLog, EndingSession, Evaluator, Evaluators, Limits, Purpose, REALIGN, Recovery,
-    Replay, RunDescription, RunFlags, Session, Settings, checkpoints, corrected_rig, recoveries, recovery,
+    Checkpoints, Clock, Data, DecisionLog, EndingSession, Evaluator, Evaluators, KeptFolder, Limits, Purpose, REALIGN,
+    Recovery, Replay, RunDescription, RunFlags, Session, Settings, checkpoints, corrected_rig, recoveries, recovery,
 };
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -26,6 +26,8 @@ use trainer::checkpoint::Checkpoint;
 use trainer::gpu::Gpu;
 use trainer::{Edits, ModelKind, ModelSpec, Resumed};
 
+/// Maximum time of the scheduled evaluations, as a fraction of the training time.
+const MAX_EVALUATION_FRAC: f64 = 0.1;
 /// Training time if no flag limits it.
 const DEFAULT_SECONDS: f64 = 120.0;
 /// Names of the flags in checkpoints.
@@ -170,8 +172,12 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
         session::check_before_data(&args.training.options(), &args.data, &images)?;
     }
     let evaluator = Evaluator::thorough(args.lpips_weights.as_deref())?;
-    let evaluators =
-        Evaluators { during_training: evaluator.clone(), max_images_during_training: usize::MAX, at_end: evaluator };
+    let evaluators = Evaluators {
+        during_training: evaluator.without_lpips(),
+        max_images_during_training: usize::MAX,
+        max_frac_during_training: Some(MAX_EVALUATION_FRAC),
+        at_end: evaluator,
+    };
     let bar = ReadBar::new(args.json);
     let mut data = match &replay {
         Some(replay) => replay.load_data(&args.data, args.images.options().rig, &|read| bar.show(read))?,
@@ -252,6 +258,7 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
             .with_checkpoints(checkpoints.map(|to| to.with_flags(run_flags.clone())))
             .with_profile(args.profile)
             .with_decisions(decisions)
+            .with_folders(KeptFolder::of_run(folder, kinds.len() > 1))
             .with_data(source.clone());
         // A replay is not restarted after a GPU failure, because its log refers to step numbers.
         let session = if replay.is_none() { session.with_recovery(recovery) } else { session };
@@ -288,7 +295,7 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
         out,
     };
     let recoverable = recoveries::describe_recoverable(&mut sessions);
-    let finished = session::finish(sessions.into_iter().zip(folders).zip(seeds).map(ending).collect());
+    let finished = session::finish(sessions.into_iter().zip(folders).zip(seeds).map(ending).collect(), None);
     let finished = finished.map_err(|error| recovery::with_recoverable(error, &recoverable))?;
     if !args.json {
         print_next_commands(&finished);

@@ -28,6 +28,8 @@ mod received_files;
 mod resume;
 mod robot_silhouette;
 #[cfg(feature = "sim")]
+mod run_folder;
+#[cfg(feature = "sim")]
 mod small_rig;
 mod together;
 mod view;

@@ -168,14 +168,17 @@ impl<M: Recalibrate + 'static> Aligned<M> {
 
     /// Resumes from a checkpoint. `resume` receives the corrected keyframes, and returns the model and the keyframes
     /// that it was not trained on.
+    ///
+    /// * `placeholders`: stand for missing keyframes, with their corrected poses. They must be removed afterwards.
     pub fn resume(
         checkpoint: &Checkpoint,
         keyframes: &[Arc<Keyframe>],
+        placeholders: &[Arc<Keyframe>],
         resume: impl FnOnce(&Checkpoint, &[Arc<Keyframe>]) -> Result<(M, Vec<Arc<Keyframe>>), Error>,
     ) -> Result<ResumedModel, Error> {
         let mut own_checkpoint = checkpoint.clone();
         let Some(state) = own_checkpoint.state.as_object_mut().and_then(|state| state.remove(STATE_KEY)) else {
-            let (model, untrained) = resume(checkpoint, keyframes)?;
+            let (model, untrained) = resume(checkpoint, &[keyframes, placeholders].concat())?;
             return Ok((Box::new(model), untrained));
         };
         let invalid_state = |error: serde_json::Error| Error::CheckpointState { reason: error.to_string() };
@@ -198,18 +201,18 @@ impl<M: Recalibrate + 'static> Aligned<M> {
         if !is_aligned {
             alignment_task.request_again();
         }
-        let corrected: Vec<_> = keyframes.iter().map(|keyframe| alignment_task.corrected(keyframe)).collect();
+        let corrected = keyframes.iter().map(|keyframe| alignment_task.corrected(keyframe));
+        let corrected: Vec<_> = corrected.chain(placeholders.iter().cloned()).collect();
         let (model, untrained) = resume(&own_checkpoint, &corrected)?;
         let originals: BTreeMap<_, _> = keyframes.iter().map(|keyframe| (id_of(keyframe), keyframe)).collect();
         let original = |id: (&str, i64)| originals.get(&id).map(|keyframe| Arc::clone(keyframe));
-        let mut original_keyframes: Vec<_> =
-            ids.iter().filter_map(|(camera, nanos)| original((camera, *nanos))).collect();
-        // After recovery, evicted keyframes have no pixels. They are removed from the model, too.
-        let has_pixels = |keyframe: &Arc<Keyframe>| !keyframe.rgba_srgb.is_empty();
-        let n_with_pixels =
-            |n: usize| original_keyframes.iter().take(n).filter(|keyframe| has_pixels(keyframe)).count();
+        // After recovery, evicted keyframes have no pixels. They are removed from the model, like missing ones.
+        let with_pixels = |(camera, nanos): &(String, i64)| {
+            original((camera, *nanos)).filter(|keyframe: &Arc<Keyframe>| !keyframe.rgba_srgb.is_empty())
+        };
+        let n_with_pixels = |n: usize| ids.iter().take(n).filter_map(with_pixels).count();
         let [n_begun, n_references] = [n_begun, n_references].map(|n| n.map(n_with_pixels));
-        original_keyframes.retain(has_pixels);
+        let original_keyframes: Vec<_> = ids.iter().filter_map(with_pixels).collect();
         // Uncorrected, because `push` corrects them.
         let untrained = untrained.iter().filter_map(|keyframe| original(id_of(keyframe))).collect();
         let mut aligned = Self {
@@ -678,7 +681,7 @@ mod tests {
         train(&mut uninterrupted, 2);
 
         let resumed = |checkpoint: &Checkpoint| {
-            Aligned::resume(checkpoint, &keyframes, |own_checkpoint, keyframes| {
+            Aligned::resume(checkpoint, &keyframes, &[], |own_checkpoint, keyframes| {
                 resume(gpu.clone(), own_checkpoint, keyframes)
             })
             .unwrap()
@@ -822,7 +825,7 @@ mod tests {
         train_on(&mut uninterrupted, &keyframes[N_FIRST..n_before]);
         let checkpoint = uninterrupted.checkpoint().unwrap().finish().unwrap();
         let resume = |own: &Checkpoint, keyframes: &[Arc<Keyframe>]| MeanColor::resume(own, keyframes);
-        let (mut resumed, untrained) = Aligned::resume(&checkpoint, &keyframes[..n_before], resume).unwrap();
+        let (mut resumed, untrained) = Aligned::resume(&checkpoint, &keyframes[..n_before], &[], resume).unwrap();
         untrained.into_iter().for_each(|keyframe| resumed.push(keyframe).unwrap());
         let ends = [&mut uninterrupted as &mut dyn Method, &mut *resumed].map(|model| {
             train_on(model, &keyframes[n_before..]);
@@ -837,7 +840,7 @@ mod tests {
         for ix in evicted {
             restored[ix] = Arc::new(Keyframe { rgba_srgb: [].into(), ..restored[ix].as_ref().clone() });
         }
-        let (mut recovered, _) = Aligned::resume(&checkpoint, &restored, resume).unwrap();
+        let (mut recovered, _) = Aligned::resume(&checkpoint, &restored, &[], resume).unwrap();
         evicted.iter().for_each(|ix| recovered.remove("wrist", keyframes[*ix].stamp).unwrap());
         train_on(&mut *recovered, &keyframes[n_before..]);
         assert_eq!(recovered.alignment().unwrap().movements.len(), 1);

@@ -1,6 +1,8 @@
 //! Errors of the trainer.
 
+use keyframe::Keyframe;
 use std::path::PathBuf;
+use std::sync::Arc;
 
 /// An error of the trainer.
 #[derive(Debug, thiserror::Error)]
@@ -194,6 +196,15 @@ pub enum Error {
     /// A checkpoint belongs to different keyframes.
     #[error("the checkpoint belongs to different data: {0}")]
     CheckpointData(String),
+    /// Keyframes that a checkpoint needs are missing.
+    #[error(
+        "the checkpoint belongs to different data: {} of its images {} missing, the first is image {} of camera {:?}",
+        .placeholders.len(), if .placeholders.len() == 1 { "is" } else { "are" }, .placeholders[0].stamp.0, .placeholders[0].camera
+    )]
+    MissingKeyframes {
+        /// Keyframes without pixels that stand for the missing ones, at least one.
+        placeholders: Vec<Arc<Keyframe>>,
+    },
     /// No registered method has this name.
     #[error("unknown method {name:?}")]
     UnknownMethod {

@@ -1,8 +1,9 @@
 //! Signatures that identify and verify the training keyframes of a model without their pixels.
 
 use crate::Error;
-use keyframe::{Keyframe, Split};
-use kinematics::Stamp;
+use keyframe::{DepthMap, Keyframe, Split};
+use kinematics::{Stamp, Transform};
+use nalgebra::{Quaternion, Translation3, UnitQuaternion};
 use serde::{Deserialize, Serialize};
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -44,6 +45,37 @@ impl KeyframeSignature {
         }
     }
 
+    /// A keyframe without pixels that stands for the recorded one.
+    fn placeholder(&self) -> Keyframe {
+        let [x, y, z, i, j, k, w] = self.world_from_camera;
+        // Bit by bit, so that it matches this signature.
+        let rotation = UnitQuaternion::new_unchecked(Quaternion::new(w, i, j, k));
+        let world_from_camera = Transform::from_parts(Translation3::new(x, y, z), rotation);
+        let depth = self.depth_size_px.map(|size_px| DepthMap {
+            size_px,
+            focal_px: self.focal_px,
+            principal_px: self.principal_px,
+            depth_m: [].into(),
+            world_from_camera,
+        });
+        Keyframe {
+            camera: self.camera.as_str().into(),
+            stamp: Stamp(self.stamp_nanos),
+            size_px: self.size_px,
+            focal_px: self.focal_px,
+            principal_px: self.principal_px,
+            rgba_srgb: [].into(),
+            depth,
+            world_from_camera,
+            twist: None,
+            readout_secs: 0.0,
+            joint_twists: [].into(),
+            base: None,
+            split: Split::Train,
+            truth: None,
+        }
+    }
+
     /// Whether the keyframe has this camera and stamp.
     pub(crate) fn is_of(&self, camera: &str, stamp: Stamp) -> bool {
         self.camera == camera && self.stamp_nanos == stamp.0
@@ -71,7 +103,7 @@ impl KeyframeSignature {
 /// The matched keyframes in the expected order, and all other keyframes.
 pub(crate) type MatchedAndOthers = (Vec<Arc<Keyframe>>, Vec<Arc<Keyframe>>);
 
-/// Finds the expected keyframes. Fails if one is missing or differs.
+/// Finds the expected keyframes. Fails if some are missing, with placeholders for them, or if one differs.
 pub(crate) fn match_keyframes(
     expected: &[KeyframeSignature],
     keyframes: &[Arc<Keyframe>],
@@ -81,16 +113,19 @@ pub(crate) fn match_keyframes(
         .filter(|keyframe| keyframe.split != Split::Test)
         .map(|keyframe| ((&*keyframe.camera, keyframe.stamp.0), keyframe))
         .collect();
-    let mut found: Vec<Arc<Keyframe>> = Vec::new();
+    let (mut found, mut missing): (Vec<Arc<Keyframe>>, Vec<Arc<Keyframe>>) = (Vec::new(), Vec::new());
     for expected in expected {
-        let (camera, stamp) = (expected.camera.as_str(), expected.stamp_nanos);
-        let keyframe = by_name
-            .get(&(camera, stamp))
-            .ok_or_else(|| Error::CheckpointData(format!("image {stamp} of camera {camera:?} is missing")))?;
+        let Some(keyframe) = by_name.get(&(expected.camera.as_str(), expected.stamp_nanos)) else {
+            missing.push(Arc::new(expected.placeholder()));
+            continue;
+        };
         if let Some(difference) = expected.difference(keyframe) {
             return Err(Error::CheckpointData(difference));
         }
         found.push(Arc::clone(keyframe));
+    }
+    if !missing.is_empty() {
+        return Err(Error::MissingKeyframes { placeholders: missing });
     }
     let is_matched = |keyframe: &Arc<Keyframe>| found.iter().any(|matched| Arc::ptr_eq(matched, keyframe));
     let others = keyframes.iter().filter(|keyframe| !is_matched(keyframe)).cloned().collect();

@@ -12,8 +12,9 @@ use std::sync::Arc;
 
 /// Creates an untrained model.
 pub type StartModel = fn(Arc<Gpu>, &ModelOptions) -> Result<Box<dyn Method>, Error>;
-/// Restores a model from a checkpoint; the keyframes must include those that the model was trained on.
-pub type ResumeModel = fn(Arc<Gpu>, &Checkpoint, &[Arc<Keyframe>]) -> Result<ResumedModel, Error>;
+/// Restores a model from a checkpoint. The keyframes must include those that the model was trained on, except those that
+/// placeholders stand for (see [`Aligned::resume`](crate::Aligned::resume)).
+pub type ResumeModel = fn(Arc<Gpu>, &Checkpoint, &[Arc<Keyframe>], &[Arc<Keyframe>]) -> Result<ResumedModel, Error>;
 /// Loads a saved model from a folder or a single file.
 pub type LoadModel = fn(Arc<Gpu>, &Path) -> Result<Box<dyn Method>, Error>;
 

@@ -6,6 +6,7 @@ use crate::model_options::{CommonOptions, MethodOptions, ModelOptions};
 use crate::registry::ModelKind;
 use crate::{Edits, Error, Method};
 use keyframe::Keyframe;
+use kinematics::Stamp;
 use serde::Deserialize;
 use serde_json::Value;
 use std::path::Path;
@@ -100,11 +101,43 @@ impl ModelSpec {
 ///
 /// Fails if the checkpoint is invalid, if keyframes are missing or differ, or on an error of the GPU.
 pub fn resume(gpu: Arc<Gpu>, checkpoint: &Checkpoint, keyframes: &[Arc<Keyframe>]) -> Result<Resumed, Error> {
+    resume_with(gpu, checkpoint, keyframes, &[])
+}
+
+/// Like [`resume`], but keyframes may be missing. They are removed from the model, which keeps what it has learned from
+/// them. Also returns their cameras and stamps.
+///
+/// # Errors
+///
+/// Fails if the checkpoint is invalid, if keyframes differ, or on an error of the GPU.
+pub fn resume_without_missing(
+    gpu: Arc<Gpu>,
+    checkpoint: &Checkpoint,
+    keyframes: &[Arc<Keyframe>],
+) -> Result<(Resumed, Vec<(Arc<str>, Stamp)>), Error> {
+    let placeholders = match resume_with(gpu.clone(), checkpoint, keyframes, &[]) {
+        Ok(resumed) => return Ok((resumed, Vec::new())),
+        Err(Error::MissingKeyframes { placeholders }) => placeholders,
+        Err(error) => return Err(error),
+    };
+    let mut resumed = resume_with(gpu, checkpoint, keyframes, &placeholders)?;
+    for missing in &placeholders {
+        resumed.method.remove(&missing.camera, missing.stamp)?;
+    }
+    Ok((resumed, placeholders.iter().map(|missing| (Arc::clone(&missing.camera), missing.stamp)).collect()))
+}
+
+fn resume_with(
+    gpu: Arc<Gpu>,
+    checkpoint: &Checkpoint,
+    keyframes: &[Arc<Keyframe>],
+    placeholders: &[Arc<Keyframe>],
+) -> Result<Resumed, Error> {
     let kind = registered(&checkpoint.method)?;
     let options = checkpoint.state.get("options").unwrap_or(&Value::Null);
     let options = ModelOptions::deserialize(options)
         .map_err(|error| Error::CheckpointState { reason: format!("options: {error}") })?;
-    let (method, untrained) = (kind.entry().resume)(gpu, checkpoint, keyframes)?;
+    let (method, untrained) = (kind.entry().resume)(gpu, checkpoint, keyframes, placeholders)?;
     Ok(Resumed { model_spec: ModelSpec { kind, options }, method, untrained, edits: checkpoint.edits.clone() })
 }
 

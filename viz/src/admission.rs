@@ -108,6 +108,8 @@ struct ConnectionState {
 
 #[derive(Debug)]
 struct Client {
+    /// Operators are replaced only if they are dispensable; viewers make room for operators.
+    is_operator: bool,
     admitted: Instant,
     /// Time of the last message. Pongs do not count, because libraries send them automatically.
     last_message: Option<Instant>,
@@ -157,15 +159,22 @@ impl Admission {
         oldest.inspect(|(.., connection)| connection.close("replaced by a new connection")).is_some()
     }
 
-    /// Registers a WebSocket client on its connection. At the limit, it replaces the most dispensable client.
-    pub(crate) fn admit_client(&self, connection: &Connection) -> bool {
+    /// Registers a WebSocket client on its connection. At the limit, it replaces the most dispensable client. If all are in
+    /// use, an operator replaces the viewer that came last, so that viewers cannot lock operators out.
+    pub(crate) fn admit_client(&self, connection: &Connection, is_operator: bool) -> bool {
         // Held until the client is registered, so that two clients cannot take the same free slot.
         let registry = self.registry();
         let now = Instant::now();
         let admitted = registry.connections.values().filter(|other| other.is_admitted());
         let (mut n_admitted, mut most_dispensable): (usize, Option<(Dispensability, &Arc<Connection>)>) = (0, None);
+        let mut last_viewer: Option<(Instant, &Arc<Connection>)> = None;
         for other in admitted {
             n_admitted += 1;
+            if let Some(since) = other.viewer_since()
+                && last_viewer.is_none_or(|(last, _)| since >= last)
+            {
+                last_viewer = Some((since, other));
+            }
             if let Some(dispensability) = other.dispensability(now)
                 && most_dispensable.is_none_or(|(worst_so_far, _)| dispensability > worst_so_far)
             {
@@ -173,11 +182,12 @@ impl Admission {
             }
         }
         if n_admitted >= self.limits.clients {
-            let Some((_, other)) = most_dispensable else { return false };
+            let last_viewer = last_viewer.filter(|_| is_operator).map(|(_, other)| other);
+            let Some(other) = most_dispensable.map(|(_, other)| other).or(last_viewer) else { return false };
             other.close("replaced by a new client");
         }
         connection.state().client =
-            Some(Client { admitted: now, last_message: None, pinged: None, has_answered: false });
+            Some(Client { is_operator, admitted: now, last_message: None, pinged: None, has_answered: false });
         true
     }
 
@@ -270,6 +280,12 @@ impl Connection {
     fn is_admitted(&self) -> bool {
         let state = self.state();
         state.client.is_some() && !state.is_closed
+    }
+
+    /// Time at which the client was admitted as a viewer; `None` if it is an operator.
+    fn viewer_since(&self) -> Option<Instant> {
+        let state = self.state();
+        state.client.as_ref().filter(|client| !client.is_operator).map(|client| client.admitted)
     }
 
     /// Eviction order of the client; `None` for a client in use.
@@ -555,13 +571,35 @@ mod tests {
             let (b, _b) = port.connect();
             let (c, _c) = port.connect();
             for stream in [&a, &b] {
-                assert!(port.admission.admit_client(stream.connection()));
+                assert!(port.admission.admit_client(stream.connection(), false));
                 act_like_page(stream);
             }
-            assert!(!port.admission.admit_client(c.connection()), "both clients are in use");
+            assert!(!port.admission.admit_client(c.connection(), false), "both clients are in use");
             drop(a);
-            assert!(port.admission.admit_client(c.connection()));
+            assert!(port.admission.admit_client(c.connection(), false));
             assert!(!is_closed(&b));
+        });
+    }
+
+    #[test]
+    fn viewers_make_room_for_operators() {
+        run(async {
+            let port = Port::open();
+            let (a, _a) = port.connect();
+            let (b, _b) = port.connect();
+            let [(c, _c), (d, _d), (e, _e)] = [port.connect(), port.connect(), port.connect()];
+            for viewer in [&a, &b] {
+                assert!(port.admission.admit_client(viewer.connection(), false));
+                act_like_page(viewer);
+            }
+            for operator in [&c, &d] {
+                assert!(port.admission.admit_client(operator.connection(), true), "a viewer makes room");
+                act_like_page(operator);
+            }
+            assert!(is_closed(&a) && is_closed(&b));
+            assert!(!port.admission.admit_client(e.connection(), true), "operators in use stay");
+            assert!(!port.admission.admit_client(e.connection(), false));
+            assert!(!is_closed(&c) && !is_closed(&d));
         });
     }
 
@@ -573,11 +611,15 @@ mod tests {
             let (other, _b) = port.connect();
             let (newcomer, _c) = port.connect();
             assert!(
-                port.admission.admit_client(speaking.connection()) && port.admission.admit_client(other.connection())
+                port.admission.admit_client(speaking.connection(), false)
+                    && port.admission.admit_client(other.connection(), false)
             );
             act_like_page(&speaking);
             other.connection().last_message(); // It does not read.
-            assert!(port.admission.admit_client(newcomer.connection()), "the other client never answered a ping");
+            assert!(
+                port.admission.admit_client(newcomer.connection(), false),
+                "the other client never answered a ping"
+            );
             assert!(is_closed(&other) && !is_closed(&speaking));
 
             let now = Instant::now();
@@ -605,7 +647,7 @@ mod tests {
             assert!(stuck.connection().timeout_reason(soon + WRITE_TIMEOUT).is_some());
 
             let (client, _b) = port.connect();
-            assert!(port.admission.admit_client(client.connection()) && client.connection().start_ping());
+            assert!(port.admission.admit_client(client.connection(), false) && client.connection().start_ping());
             assert_eq!(client.connection().timeout_reason(soon), None);
             assert!(client.connection().timeout_reason(soon + PONG_TIMEOUT).is_some());
             client.connection().record_pong();

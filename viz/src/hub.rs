@@ -1,5 +1,6 @@
 //! Shared state of the training thread and the server. The training thread never waits for a client.
 
+use crate::access::Role;
 use crate::base_path::BasePath;
 use crate::chunk_list::ChunkList;
 use crate::edit::EditRequest;
@@ -371,8 +372,8 @@ impl Hub {
         queue.has_work()
     }
 
-    pub(crate) fn join(&self) -> (u64, Arc<Notify>) {
-        let (client, wake) = self.queue().join();
+    pub(crate) fn join(&self, role: Role) -> (u64, Arc<Notify>) {
+        let (client, wake) = self.queue().join(role);
         self.set_demand(client, Demand::new(Instant::now()));
         (client, wake)
     }

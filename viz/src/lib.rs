@@ -19,6 +19,7 @@ mod broadcast;
 mod certificate;
 mod chunk_list;
 mod chunk_sender;
+mod client_log;
 mod client_updates;
 mod clock;
 mod compact_depth;

@@ -1,7 +1,9 @@
 //! Render requests by client and view: the newest request of each view, stage by stage. Clients take turns, and so do
 //! the views of a client.
 
+use crate::access::Role;
 use crate::picture_times::{TrainedKeyframes, UnreportedPictures};
+use crate::protocol::DepthFormat;
 use crate::server_message::PictureHeader;
 use crate::view_request::ViewRequest;
 use std::collections::{BTreeMap, VecDeque};
@@ -12,6 +14,11 @@ use trainer::Rendered;
 
 /// Maximum number of pictures per client that are being rendered or sent. It limits rendering for slow clients.
 const MAX_UNSENT: usize = 2;
+/// Memory that each client may use for these pictures, bytes. Every picture fits whose depth is not requested as f32.
+const CLIENT_BYTES: usize = 16 << 20;
+/// Memory for larger pictures, which the clients of a role share. Operators have a share of their own, so that viewers that
+/// read slowly do not delay them.
+const SHARED_BYTES: usize = 256 << 20;
 
 /// Maximum number of results that wait to be sent to a client. A client that does not read misses the reasons of further
 /// failed edits.
@@ -32,11 +39,13 @@ pub(crate) struct Queue {
 }
 
 /// Pending work of one client.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 struct ClientQueue {
+    role: Role,
     views: BTreeMap<Arc<str>, ViewQueue>,
     last_served: Arc<str>,
-    n_unsent: usize,
+    /// Bytes of the pictures that are being rendered or sent, the oldest first.
+    unsent: VecDeque<usize>,
     outbox: VecDeque<Outgoing>,
     unreported: UnreportedPictures,
     wake: Arc<Notify>,
@@ -93,9 +102,9 @@ pub(crate) struct DrawnPicture {
 
 impl Queue {
     /// Adds a client. The returned handle is notified when its outbox has a result.
-    pub(crate) fn join(&mut self) -> (u64, Arc<Notify>) {
+    pub(crate) fn join(&mut self, role: Role) -> (u64, Arc<Notify>) {
         self.n_joined += 1;
-        let waiting = ClientQueue::default();
+        let waiting = ClientQueue::new(role);
         let wake = Arc::clone(&waiting.wake);
         self.clients.insert(self.n_joined, waiting);
         (self.n_joined, wake)
@@ -133,15 +142,22 @@ impl Queue {
 
     /// Whether [`take`](Self::take) would return a stage.
     pub(crate) fn has_work(&self) -> bool {
-        self.clients.values().any(ClientQueue::is_ready)
+        self.clients.values().any(|waiting| self.next_view(waiting).is_some())
     }
 
     /// The next stage to render: clients in turn, the views of a client in turn, and the stages of a view in order.
     pub(crate) fn take(&mut self) -> Option<RenderJob> {
-        let after = self.clients.range(self.last_served + 1..).find(|(_, waiting)| waiting.is_ready());
-        let (&client, _) = after.or_else(|| self.clients.iter().find(|(_, waiting)| waiting.is_ready()))?;
+        let (after, before) = (self.clients.range(self.last_served + 1..), self.clients.range(..=self.last_served));
+        let (client, name) = after.chain(before).find_map(|(&id, waiting)| Some((id, self.next_view(waiting)?)))?;
         self.last_served = client;
-        self.clients.get_mut(&client)?.take(client)
+        self.clients.get_mut(&client)?.take(client, name)
+    }
+
+    /// The view whose picture a client gets next; `None` if there is none, or if there is no room for its pictures.
+    fn next_view(&self, waiting: &ClientQueue) -> Option<Arc<str>> {
+        let same_role = self.clients.values().filter(|other| other.role == waiting.role);
+        let n_shared = same_role.map(|other| other.n_unsent_bytes().saturating_sub(CLIENT_BYTES)).sum();
+        waiting.next_view(SHARED_BYTES.saturating_sub(n_shared))
     }
 
     /// Records the render time of the last stage of a request.
@@ -179,22 +195,45 @@ impl Queue {
     /// Records that a stage was sent or will never be rendered.
     pub(crate) fn release(&mut self, client: u64) {
         if let Some(waiting) = self.clients.get_mut(&client) {
-            waiting.n_unsent = waiting.n_unsent.saturating_sub(1);
+            waiting.unsent.pop_front();
         }
     }
 }
 
 impl ClientQueue {
-    fn is_ready(&self) -> bool {
-        self.n_unsent < MAX_UNSENT && self.views.values().any(|view| view.view_request.is_some())
+    fn new(role: Role) -> Self {
+        Self {
+            role,
+            views: BTreeMap::new(),
+            last_served: Arc::default(),
+            unsent: VecDeque::new(),
+            outbox: VecDeque::new(),
+            unreported: UnreportedPictures::default(),
+            wake: Arc::default(),
+        }
     }
 
-    fn take(&mut self, client: u64) -> Option<RenderJob> {
-        let after = (Bound::Excluded(Arc::clone(&self.last_served)), Bound::Unbounded);
-        let is_pending = |(_, view): &(&Arc<str>, &ViewQueue)| view.view_request.is_some();
-        let next = self.views.range::<Arc<str>, _>(after).find(is_pending);
-        let name = Arc::clone(next.or_else(|| self.views.iter().find(is_pending))?.0);
+    fn n_unsent_bytes(&self) -> usize {
+        self.unsent.iter().sum()
+    }
+
+    /// The next view in turn whose picture fits into the client's own memory, or as its only picture into this much more.
+    fn next_view(&self, n_shared_bytes: usize) -> Option<Arc<str>> {
+        if self.unsent.len() >= MAX_UNSENT {
+            return None;
+        }
+        let n_more = if self.unsent.is_empty() { n_shared_bytes } else { 0 };
+        let n_free = (CLIENT_BYTES + n_more).saturating_sub(self.n_unsent_bytes());
+        let last = Bound::Excluded(Arc::clone(&self.last_served));
+        let after = self.views.range::<Arc<str>, _>((last, Bound::Unbounded));
+        let mut in_turn = after.chain(&self.views);
+        let fits = |view: &ViewQueue| view.n_bytes_of_next().is_some_and(|n| n <= n_free);
+        in_turn.find(|(_, view)| fits(view)).map(|(name, _)| Arc::clone(name))
+    }
+
+    fn take(&mut self, client: u64, name: Arc<str>) -> Option<RenderJob> {
         let view = self.views.get_mut(&name)?;
+        self.unsent.push_back(view.n_bytes_of_next()?);
         let view_request = view.view_request.clone()?;
         let stage = view.next_stage;
         view.next_stage += 1;
@@ -202,8 +241,18 @@ impl ClientQueue {
             view.view_request = None;
         }
         self.last_served = name;
-        self.n_unsent += 1;
         Some(RenderJob { client, view_request, stage })
+    }
+}
+
+impl ViewQueue {
+    /// Memory that the picture of the next stage needs until it is sent, bytes: JPEG and packed depth take less than a byte
+    /// per pixel together; with depth as f32, color is not packed on the GPU either.
+    fn n_bytes_of_next(&self) -> Option<usize> {
+        let view_request = self.view_request.as_ref()?;
+        let [width, height] = view_request.stage_request(self.next_stage).size_px.map(|n| n as usize);
+        let is_f32 = view_request.depth == Some(DepthFormat::F32);
+        Some(width * height * if is_f32 { 4 + 4 * usize::from(view_request.color) } else { 1 })
     }
 }
 
@@ -225,8 +274,9 @@ fn n_px_of_last_stage(view_request: &ViewRequest) -> f64 {
 
 #[cfg(test)]
 mod tests {
-    use super::{MAX_OUTBOX, Outgoing, Queue};
-    use crate::protocol::RenderMessage;
+    use super::{CLIENT_BYTES, MAX_OUTBOX, Outgoing, Queue, SHARED_BYTES};
+    use crate::access::Role;
+    use crate::protocol::{DepthFormat, RenderMessage};
     use crate::view_request::ViewRequest;
 
     fn view_request(id: u64) -> ViewRequest {
@@ -251,8 +301,8 @@ mod tests {
     #[test]
     fn clients_are_served_round_robin() {
         let mut queue = Queue::default();
-        let (a, _) = queue.join();
-        let (b, _) = queue.join();
+        let (a, _) = queue.join(Role::Operator);
+        let (b, _) = queue.join(Role::Operator);
         queue.view_request(a, view_request(10));
         queue.view_request(b, view_request(20));
         let served = drain(&mut queue);
@@ -262,7 +312,7 @@ mod tests {
     #[test]
     fn newer_request_replaces_waiting_stages() {
         let mut queue = Queue::default();
-        let (a, _) = queue.join();
+        let (a, _) = queue.join(Role::Operator);
         queue.view_request(a, view_request(1));
         let first = queue.take().expect("a request is pending");
         assert_eq!((first.view_request.id, first.stage), (1, 0));
@@ -274,8 +324,8 @@ mod tests {
     #[test]
     fn slow_client_delays_only_itself() {
         let mut queue = Queue::default();
-        let (slow, _) = queue.join();
-        let (fast, _) = queue.join();
+        let (slow, _) = queue.join(Role::Operator);
+        let (fast, _) = queue.join(Role::Operator);
         queue.view_request(slow, view_request(1));
         queue.view_request(fast, view_request(2));
         let mut served = Vec::new();
@@ -291,9 +341,36 @@ mod tests {
     }
 
     #[test]
+    fn memory_of_unsent_pictures_is_bounded() {
+        let large = |id, view: &str| {
+            let mut large = view_request(id);
+            (large.view, large.stages, large.depth) = (view.into(), vec![1.0], Some(DepthFormat::F32));
+            large.request.size_px = [4096, 4096];
+            large
+        };
+        let mut queue = Queue::default();
+        let viewers: Vec<u64> = (0..32).map(|_| queue.join(Role::Viewer).0).collect();
+        for viewer in &viewers {
+            (0..8).for_each(|n| _ = queue.view_request(*viewer, large(n, &n.to_string())));
+        }
+        let served: Vec<u64> = std::iter::from_fn(|| queue.take()).map(|job| job.client).collect();
+        assert_eq!(served, viewers[..2], "one large picture each, of two clients");
+        let n_bytes: usize = queue.clients.values().map(super::ClientQueue::n_unsent_bytes).sum();
+        assert!(n_bytes <= viewers.len() * CLIENT_BYTES + SHARED_BYTES);
+        let (operator, _) = queue.join(Role::Operator);
+        queue.view_request(operator, large(1, ""));
+        assert_eq!(queue.take().expect("viewers do not delay operators").client, operator);
+        let (other, _) = queue.join(Role::Viewer);
+        queue.view_request(other, view_request(5));
+        assert_eq!(queue.take().expect("a small picture always fits").client, other);
+        queue.release(viewers[0]);
+        assert_eq!(queue.take().expect("there is room again").client, viewers[10]);
+    }
+
+    #[test]
     fn fast_full_picture_skips_coarse_stages() {
         let mut queue = Queue::default();
-        let (a, _) = queue.join();
+        let (a, _) = queue.join(Role::Operator);
         let draw = |queue: &mut Queue, id: u64, millis: f64, change: fn(&mut ViewRequest)| {
             let mut requested = view_request(id);
             change(&mut requested);
@@ -328,7 +405,7 @@ mod tests {
     #[test]
     fn client_that_does_not_read_gets_a_limited_number_of_results() {
         let mut queue = Queue::default();
-        let (a, _) = queue.join();
+        let (a, _) = queue.join(Role::Operator);
         let rejected = |id| Outgoing::Rejected { id: Some(id), reason: String::new() };
         (0..1000).for_each(|id| queue.push_outgoing(a, rejected(id)));
         queue.push_outgoing(a, Outgoing::Failed { id: 5, view: "".into(), reason: String::new() });
@@ -343,7 +420,7 @@ mod tests {
     #[test]
     fn disconnected_client_is_forgotten() {
         let mut queue = Queue::default();
-        let (a, _) = queue.join();
+        let (a, _) = queue.join(Role::Operator);
         queue.view_request(a, view_request(1));
         queue.leave(a);
         assert!(queue.take().is_none() && !queue.has_work() && queue.n_clients() == 0);

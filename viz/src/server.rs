@@ -4,6 +4,7 @@ use crate::access::{Access, Role, Tokens};
 use crate::admission::{Admission, Connection, GuardedStream, Limits};
 use crate::broadcast::broadcast;
 use crate::certificate::Certificate;
+use crate::client_log::ClientLog;
 use crate::clock::ServerClock;
 use crate::page::{FILES, has_version};
 use crate::protocol::MAX_MESSAGE_BYTES;
@@ -164,7 +165,8 @@ async fn serve(
     let (latest_messages_sender, latest_messages) = watch::channel(crate::broadcast::LatestMessages::default());
     tokio::spawn(broadcast(hub.clone(), clock, latest_messages_sender));
     let admission = Admission::new(Limits::of_process());
-    let server_context = ServerContext { hub: hub.clone(), clock, latest_messages, stopped: stopped.clone() };
+    let log = Arc::new(ClientLog::new());
+    let server_context = ServerContext { hub: hub.clone(), clock, latest_messages, log, stopped: stopped.clone() };
     let app = TowerToHyperService::new(router(AppState {
         server_context,
         admission: Arc::clone(&admission),
@@ -349,7 +351,7 @@ async fn connect(
     Extension(role): Extension<Role>,
     State(app_state): State<AppState>,
 ) -> Response {
-    if !app_state.admission.admit_client(&connection) {
+    if !app_state.admission.admit_client(&connection, role == Role::Operator) {
         return (StatusCode::SERVICE_UNAVAILABLE, "too many clients are connected, try again later").into_response();
     }
     upgrade

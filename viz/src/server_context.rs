@@ -2,7 +2,9 @@
 
 use crate::Hub;
 use crate::broadcast::LatestMessages;
+use crate::client_log::ClientLog;
 use crate::clock::ServerClock;
+use std::sync::Arc;
 use tokio::sync::watch;
 
 /// Shared by all sessions.
@@ -14,6 +16,8 @@ pub(crate) struct ServerContext {
     pub(crate) clock: ServerClock,
     /// The latest encoded messages.
     pub(crate) latest_messages: watch::Receiver<LatestMessages>,
+    /// What clients do.
+    pub(crate) log: Arc<ClientLog>,
     /// Becomes true when the server stops.
     pub(crate) stopped: watch::Receiver<bool>,
 }

@@ -3,6 +3,7 @@
 use crate::Hub;
 use crate::access::Role;
 use crate::admission::Connection;
+use crate::client_log::ClientLog;
 use crate::clock::ServerClock;
 use crate::edit::EditRequest;
 use crate::hub::{Demand, MAX_WAITING_EDITS};
@@ -20,20 +21,22 @@ use futures_util::stream::SplitStream;
 use serde::Deserialize;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
-use tokio::sync::mpsc::error::TrySendError;
 use tokio::sync::{mpsc, watch};
 
-/// Maximum number of unread replies. A client with more unread replies is disconnected.
+/// Maximum number of replies that wait to be sent. Further messages of the client are read only when there is room.
 const MAX_REPLIES: usize = 64;
+/// A client that leaves [`MAX_REPLIES`] replies unread for this long is disconnected.
+const MAX_REPLY_WAIT: Duration = Duration::from_secs(2);
 /// After a goodbye, the connection stays open until the client closes it, but at most for this time. If it were closed while
 /// something from the client is unread, the kernel would reset it and discard what was not sent yet, including the goodbye.
 const LINGER: Duration = Duration::from_millis(300);
 
 /// Serves one client until either side disconnects.
 pub(crate) async fn serve(socket: WebSocket, connection: Arc<Connection>, role: Role, server_context: ServerContext) {
-    let (client, wake) = server_context.hub.join();
+    let (client, wake) = server_context.hub.join(role);
     let client_guard = ClientGuard { hub: &server_context.hub, client };
-    log::info!("client {client} connected as {}", role.name());
+    let log = &server_context.log;
+    log.line(format_args!("client {client} connected as {}", role.name()));
     let (sink, stream) = socket.split();
     let (replies, waiting_replies) = mpsc::channel(MAX_REPLIES);
     let (demand_sender, demand) = watch::channel(Demand::new(Instant::now()));
@@ -46,6 +49,7 @@ pub(crate) async fn serve(socket: WebSocket, connection: Arc<Connection>, role: 
         connection: &connection,
         replies,
         demand: demand_sender,
+        log,
     };
     let link = LinkRate::default();
     connection.set_send_buffer(link.buffer_bytes());
@@ -68,7 +72,7 @@ pub(crate) async fn serve(socket: WebSocket, connection: Arc<Connection>, role: 
         }
     }
     drop(client_guard);
-    log::info!("client {client} disconnected");
+    log.line(format_args!("client {client} disconnected"));
 }
 
 /// Removes a client from the hub when its session ends, for whatever reason.
@@ -92,6 +96,7 @@ struct Reader<'a> {
     connection: &'a Connection,
     replies: mpsc::Sender<Reply>,
     demand: watch::Sender<Demand>,
+    log: &'a ClientLog,
 }
 
 impl Reader<'_> {
@@ -118,14 +123,15 @@ impl Reader<'_> {
             self.connection.last_message();
             let Some(reply) = reply else { continue };
             let is_last = matches!(reply, Reply::Goodbye { .. });
-            match self.replies.try_send(reply) {
-                Ok(()) if is_last => return self.discard().await,
-                Ok(()) => {}
-                Err(TrySendError::Full(_)) => {
-                    log::info!("client {} disconnected: it left {MAX_REPLIES} replies unread", self.client);
+            // The writer may not have had time to send the replies to a burst of messages.
+            match tokio::time::timeout(MAX_REPLY_WAIT, self.replies.send(reply)).await {
+                Ok(Ok(())) if is_last => return self.discard().await,
+                Ok(Ok(())) => {}
+                Err(_) => {
+                    self.log.line(format_args!("client {}: it left {MAX_REPLIES} replies unread", self.client));
                     return;
                 }
-                Err(TrySendError::Closed(_)) => return self.discard().await,
+                Ok(Err(_)) => return self.discard().await,
             }
         }
     }
@@ -171,7 +177,7 @@ impl Reader<'_> {
                 None
             }
             ClientMessage::Control(ControlMessage { action }) => {
-                log::info!("client {}: {action:?}", self.client);
+                self.log.line(format_args!("client {}: {action:?}", self.client));
                 self.hub.control(action);
                 None
             }
@@ -183,7 +189,7 @@ impl Reader<'_> {
             }
             ClientMessage::Edit(message) => {
                 let request = EditRequest::check(self.client, &message)?;
-                log::info!("client {}: edit: {}", self.client, request.action());
+                self.log.line(format_args!("client {}: edit: {}", self.client, request.action()));
                 if !self.hub.edit(request) {
                     return Err(InvalidRequest::Edits { max: MAX_WAITING_EDITS });
                 }

@@ -60,12 +60,18 @@ pub enum ConfigError {
         allowed: String,
     },
     /// The rig file has several problems.
-    #[error("{first}{}", .others.iter().map(|other| format!("\n  also: {other}")).collect::<String>())]
+    #[error(
+        "{first}{}{}",
+        .others.iter().map(|other| format!("\n  also: {other}")).collect::<String>(),
+        if *.n_more > 0 { format!("\n  and {n_more} more") } else { String::new() }
+    )]
     Several {
         /// The problem that is most likely the cause of others.
         first: Box<Self>,
-        /// The other problems.
+        /// The other problems, a limited number.
         others: Vec<Self>,
+        /// Number of problems besides these.
+        n_more: usize,
     },
     /// The robot description does not match the rig file.
     #[error("{file}: {key}: {reason}")]

@@ -5,10 +5,17 @@
 use super::error::{ConfigError, SourceLocation};
 use crate::nearest_name;
 use std::borrow::Cow;
-use std::cell::RefCell;
+use std::cell::{Cell, RefCell};
 use std::collections::{BTreeMap, BTreeSet};
 use toml::de::{DeTable, DeValue};
 use toml::{Table, Value};
+
+/// Problems that are kept; more are only counted.
+const MAX_PROBLEMS: usize = 50;
+
+/// Maximum number of tables with free names: cameras, scanners, motors or tags. More are a mistake of a program that wrote
+/// the file.
+const MAX_TABLES: usize = 1000;
 
 /// State shared by all sections while a rig file is read.
 #[derive(Debug)]
@@ -18,6 +25,7 @@ pub(super) struct ParseContext {
     lines: BTreeMap<String, usize>,
     flags: BTreeSet<String>,
     problems: RefCell<Vec<ConfigError>>,
+    n_more_problems: Cell<usize>,
     /// Every key that was read, by dotted path with `NAME` for free names.
     accessed: RefCell<BTreeSet<String>>,
 }
@@ -26,13 +34,22 @@ impl ParseContext {
     /// Records the lines of all keys; fails if the text is not TOML.
     pub(super) fn new(file: &str, text: &str, flags: BTreeSet<String>) -> Result<Self, ConfigError> {
         let mut lines = BTreeMap::new();
+        let ends: Vec<usize> = text.bytes().enumerate().filter(|(_, byte)| *byte == b'\n').map(|(at, _)| at).collect();
+        let line_of = |offset: usize| ends.partition_point(|end| *end < offset) + 1;
         let table = DeTable::parse(text).map_err(|e| ConfigError::Syntax {
             file: file.to_owned(),
-            line: line_of(text, e.span().map_or(0, |span| span.start)),
+            line: line_of(e.span().map_or(0, |span| span.start)),
             message: e.message().to_owned(),
         })?;
-        note_lines(text, table.get_ref(), "", &mut lines);
-        Ok(Self { file: file.to_owned(), lines, flags, problems: RefCell::default(), accessed: RefCell::default() })
+        note_lines(&line_of, table.get_ref(), "", &mut lines);
+        Ok(Self {
+            file: file.to_owned(),
+            lines,
+            flags,
+            problems: RefCell::default(),
+            n_more_problems: Cell::default(),
+            accessed: RefCell::default(),
+        })
     }
 
     /// The problems, if there are any, as one error. Unknown keys come first, because they explain missing keys.
@@ -55,7 +72,7 @@ impl ParseContext {
         Some(if problems.is_empty() {
             first
         } else {
-            ConfigError::Several { first: Box::new(first), others: problems }
+            ConfigError::Several { first: Box::new(first), others: problems, n_more: self.n_more_problems.get() }
         })
     }
 
@@ -66,7 +83,12 @@ impl ParseContext {
     }
 
     fn report(&self, problem: ConfigError) {
-        self.problems.borrow_mut().push(problem);
+        let mut problems = self.problems.borrow_mut();
+        if problems.len() < MAX_PROBLEMS {
+            problems.push(problem);
+        } else {
+            self.n_more_problems.update(|n| n + 1);
+        }
     }
 
     fn location(&self, key: &str) -> SourceLocation {
@@ -87,18 +109,19 @@ impl ParseContext {
     }
 }
 
-fn note_lines(text: &str, table: &DeTable<'_>, path: &str, lines: &mut BTreeMap<String, usize>) {
+fn note_lines(
+    line_of: &impl Fn(usize) -> usize,
+    table: &DeTable<'_>,
+    path: &str,
+    lines: &mut BTreeMap<String, usize>,
+) {
     for (key, value) in table {
         let path = join(path, key.get_ref());
-        lines.insert(path.clone(), line_of(text, key.span().start));
+        lines.insert(path.clone(), line_of(key.span().start));
         if let DeValue::Table(inner) = value.get_ref() {
-            note_lines(text, inner, &path, lines);
+            note_lines(line_of, inner, &path, lines);
         }
     }
-}
-
-fn line_of(text: &str, offset: usize) -> usize {
-    text.bytes().take(offset).filter(|byte| *byte == b'\n').count() + 1
 }
 
 fn join(path: &str, key: &str) -> String {
@@ -125,6 +148,10 @@ impl<'a> Section<'a> {
     /// Ends the section and reports unread keys as unknown.
     pub(super) fn end(self) {
         for key in self.table.keys() {
+            if self.context.problems.borrow().len() >= MAX_PROBLEMS {
+                self.context.n_more_problems.update(|n| n + 1);
+                continue;
+            }
             let nearest = nearest_name(key, self.known.iter().copied());
             let path = join(&self.path, key);
             self.context.report(ConfigError::UnknownKey {
@@ -154,9 +181,15 @@ impl<'a> Section<'a> {
         }
     }
 
-    /// The tables inside this one that have free names, with their names.
+    /// The tables inside this one that have free names, with their names. More than [`MAX_TABLES`] are a problem.
     pub(super) fn named_sections(&mut self, key: &'static str) -> Vec<(String, Self)> {
         let Some(mut parent) = self.optional_section(key) else { return Vec::new() };
+        let n = parent.table.len();
+        if n > MAX_TABLES {
+            let got = Value::String(format!("{n} tables"));
+            self.invalid::<()>(key, &got, &format!("at most {MAX_TABLES} tables"));
+            parent.table.clear();
+        }
         let mut sections = Vec::new();
         for (name, value) in std::mem::take(&mut parent.table) {
             match value {

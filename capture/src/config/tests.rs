@@ -506,3 +506,15 @@ fn can_arm_needs_one_motor_per_joint() {
     let foreign = with("arm.motor.first.model", "'rs01'").expect_err("Damiao motors report their model").to_string();
     assert!(foreign.contains("arm.motor.first.model"), "{foreign}");
 }
+
+#[test]
+fn absurd_files_are_refused_quickly_with_few_problems() {
+    let load = |text: &str| Rig::parse("rig.toml", text, URDF, &[]).expect_err("absurd").to_string();
+    let unknown: String = (0..200_000).map(|n| format!("key{n} = 1\n")).collect();
+    let message = load(&format!("{unknown}{RIG}"));
+    assert!(message.starts_with("rig.toml line 1: unknown key \"key0\""), "{}", &message[..200]);
+    assert!(message.lines().count() < 60 && message.ends_with("and 199950 more"), "{} lines", message.lines().count());
+    let cameras: String = (0..20_000).map(|n| format!("[camera.c{n}]\ndriver = \"v4l2\"\n")).collect();
+    let message = load(&format!("{RIG}{cameras}"));
+    assert!(message.contains("camera is \"20001 tables\", allowed: at most 1000 tables"), "{message}");
+}

@@ -6,6 +6,7 @@ use super::reader::Recording;
 use super::topic::{Encoding, JOINT_NAMES, Topic};
 use crate::wire::{descriptor, foxglove, joint_state, point_cloud};
 use crate::{Error, Image, PixelFormat, RecordedSpan, Sample, Source, TruthImage};
+use files::{Kept, Place};
 use kinematics::{Intrinsics, Stamp};
 use mcap::McapError;
 use mcap::records::MessageHeader;
@@ -32,6 +33,10 @@ pub struct RecordingMetadata<'a> {
 /// Dropping this value completes the file. If no sample was written, the file is removed.
 pub struct Recorder {
     path: PathBuf,
+    /// The file, which somebody may remove or rename while it is written; `None` if it cannot be watched.
+    kept: Option<Kept>,
+    /// Where the file was at the last check.
+    place: Place,
     /// `None` after a failure.
     mcap: Option<mcap::Writer<Box<dyn Sink>>>,
     channels: BTreeMap<(Topic, &'static str), u16>,
@@ -89,6 +94,8 @@ impl Recorder {
         mcap.flush().map_err(recorder)?;
         Ok(Self {
             path: path.to_owned(),
+            kept: Kept::open(path).ok(),
+            place: Place::Here,
             mcap: Some(mcap),
             channels: BTreeMap::new(),
             cameras: recording_metadata
@@ -120,10 +127,40 @@ impl Recorder {
         closed.map_err(|error| self.fail(error))?;
         let flushed = self.mcap.take().map_or(Ok(()), |mcap| mcap.into_inner().flush());
         flushed.map_err(|error| self.fail(McapError::Io(error)))?;
+        self.check_place();
         if self.recorded.n_samples == 0 {
-            remove_stub(&self.path);
+            self.remove_stub();
+        } else if self.place == Place::Removed {
+            let restored = self.kept.as_ref().map_or(Ok(()), Kept::restore);
+            restored.map_err(|error| self.fail(McapError::Io(error)))?;
+            log::info!("the recording {} was written again", self.path.display());
         }
         Ok(self.recorded)
+    }
+
+    /// Warns if somebody has removed or renamed the file since the last check.
+    fn check_place(&mut self) {
+        let Some(kept) = &self.kept else { return };
+        let place = kept.place();
+        if place == self.place {
+            return;
+        }
+        let shown = self.path.display();
+        match &place {
+            Place::Here => log::info!("the recording {shown} is at its path again"),
+            Place::MovedTo(to) => {
+                log::warn!("the recording {shown} was moved to {}, and continues there", to.display())
+            }
+            Place::Removed => log::warn!("the recording {shown} was removed: it is written again at the end"),
+        }
+        self.place = place;
+    }
+
+    /// Removes the file, which has no samples.
+    fn remove_stub(&self) {
+        if self.place == Place::Here {
+            remove_stub(&self.path);
+        }
     }
 
     fn mcap(&mut self) -> mcap::McapResult<&mut mcap::Writer<Box<dyn Sink>>> {
@@ -137,7 +174,7 @@ impl Recorder {
             // The truncated chunk also contains readable samples, so they are counted by reading the file.
             self.recorded = readable(&self.path);
             if self.recorded.n_samples == 0 {
-                remove_stub(&self.path);
+                self.remove_stub();
             }
         }
         Error::Record { path: self.path.clone(), recorded: self.recorded, source: io_error(error) }
@@ -146,6 +183,7 @@ impl Recorder {
     /// Closes the open chunk, which writes all samples to the file.
     fn close_chunk(&mut self) -> mcap::McapResult<()> {
         self.mcap()?.flush()?;
+        self.check_place();
         self.recorded = RecordedSpan { n_samples: self.n_samples, seconds: duration_secs(self.stamps) };
         self.open_bytes = 0;
         Ok(())

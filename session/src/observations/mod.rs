@@ -2,13 +2,13 @@
 
 mod map;
 
+use background::Task;
 use keyframe::{DepthMap, Keyframe};
 use kinematics::{Stamp, Transform, transform};
 use map::PosedDepth;
 use std::collections::btree_map::Entry;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
-use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 use trainer::{Edits, Picture, Projection, RenderRequest};
 use viz::{Hub, KeyframePose};
@@ -70,7 +70,7 @@ pub(crate) struct ObservationPublisher {
     is_changed: bool,
     /// Poses of the depth in the last map.
     mapped: BTreeMap<Key, Transform>,
-    task: Option<(Instant, JoinHandle<()>)>,
+    task: Option<(Instant, Task<()>)>,
     next_check: Instant,
     next_map: Instant,
 }
@@ -198,7 +198,7 @@ impl ObservationPublisher {
                 hub.set_observations(&viz::ObservationMap { newest_at, ..map });
             }
         };
-        self.task = Some((Instant::now(), std::thread::spawn(compute)));
+        self.task = Some((Instant::now(), Task::start("observations", compute)));
     }
 }
 

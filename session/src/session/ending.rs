@@ -3,15 +3,15 @@
 use super::Session;
 use super::outcome::TrainingOutcome;
 use super::reporter::ScoredModel;
-use super::scoreboard::Scoreboard;
 use crate::checkpoints::Snapshot;
 use crate::evaluate::Scores;
 use crate::next_commands::{DataSource, SavedModel};
-use crate::{camera_list, run_folder};
+use crate::{camera_list, run_folder, viewer};
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use trainer::{Edits, Method, ModelKind};
+use viz::Hub;
 
 /// A trained model that has been saved and scored and is still in GPU memory.
 pub struct FinishedModel {
@@ -50,7 +50,9 @@ pub struct EndingSession<P> {
 }
 
 /// Saves all models, then scores each one and writes its report. Returns the models so that they can be viewed.
-pub fn finish(mut endings: Vec<EndingSession<impl Serialize>>) -> crate::Result<Vec<FinishedModel>> {
+///
+/// * `hub`: its clients get pictures of each model while it is scored.
+pub fn finish(mut endings: Vec<EndingSession<impl Serialize>>, hub: Option<&Hub>) -> crate::Result<Vec<FinishedModel>> {
     // All models are saved before scoring, so that a second Ctrl-C during scoring loses nothing.
     let ended_secs: Vec<f64> =
         endings.iter_mut().map(|ending| ending.session.stop_training()).collect::<crate::Result<_>>()?;
@@ -88,7 +90,7 @@ pub fn finish(mut endings: Vec<EndingSession<impl Serialize>>) -> crate::Result<
     }
     let mut finished = Vec::new();
     for (EndingSession { session, out, details }, seconds, sha256) in saved {
-        match session.report_end(&out, seconds, &sha256, &details) {
+        match session.report_end(&out, seconds, &sha256, &details, hub) {
             Ok(model) => finished.push(model),
             Err(error) => record_error(error),
         }
@@ -108,7 +110,7 @@ impl Session {
     /// Scores the final model without saving it.
     pub fn score_without_saving(mut self) -> crate::Result<TrainingOutcome> {
         let seconds = self.stop_training()?;
-        self.score_at_end(seconds)
+        self.score_at_end(seconds, None)
     }
 
     /// Waits for queued work and returns the training time in seconds.
@@ -121,6 +123,7 @@ impl Session {
 
     /// Saves the model, in a temporary folder if `out` cannot be written. `seconds`: training time.
     fn save(&mut self, out: &Path, seconds: f64) -> crate::Result<Saved> {
+        self.persistence.check_folders();
         self.persistence.end_decisions(self.method.as_mut())?;
         let progress = self.method.progress();
         if progress.step > 0 && progress.primitives == 0 {
@@ -186,8 +189,9 @@ impl Session {
         seconds: f64,
         checkpoint_sha256: &str,
         details: &impl Serialize,
+        hub: Option<&Hub>,
     ) -> crate::Result<FinishedModel> {
-        let outcome = self.score_at_end(seconds)?;
+        let outcome = self.score_at_end(seconds, hub)?;
         let method = self.method.as_mut();
         // Rendered before profiling, because profiling trains the model further.
         let comparisons = self.reporter.compare(method, self.scoreboard.tests(), &outcome.per_image);
@@ -216,8 +220,27 @@ impl Session {
         })
     }
 
-    fn score_at_end(&mut self, seconds: f64) -> crate::Result<TrainingOutcome> {
-        let per_image = self.without_clock(Scoreboard::score_all)?;
+    fn score_at_end(&mut self, seconds: f64, hub: Option<&Hub>) -> crate::Result<TrainingOutcome> {
+        self.gpu.wait()?;
+        self.persistence.log_render();
+        let (n_all, kind) = (self.scoreboard.tests().len(), self.reporter.kind());
+        let (reporter, edits) = (&mut self.reporter, &self.edits);
+        let mut n_reported = None;
+        let meanwhile = |method: &mut dyn Method, n_scored: usize| {
+            if n_reported.replace(n_scored) != Some(n_scored) {
+                reporter.report_scoring(n_scored, n_all);
+                if let Some(hub) = hub {
+                    hub.set_state(&format!("scoring, {n_scored} of {n_all} images"));
+                }
+            }
+            if let Some(pending) = hub.and_then(Hub::next_request) {
+                match pending.method() {
+                    Some(other) if other != kind.name() => pending.fail(&format!("{} is being scored", kind.name())),
+                    _ => viewer::answer(pending, method, edits),
+                }
+            }
+        };
+        let per_image = self.scoreboard.score_all(self.method.as_mut(), meanwhile)?;
         let progress = self.method.progress();
         Ok(TrainingOutcome {
             seconds,

@@ -3,6 +3,7 @@
 
 use crate::checkpoints::{self, CheckpointWrite, Checkpoints, Snapshot};
 use crate::decisions::DecisionLog;
+use crate::kept_folder::KeptFolder;
 use crate::recovery::Recovery;
 use keyframe::{DepthMap, Keyframe};
 use kinematics::Stamp;
@@ -18,6 +19,7 @@ pub(super) struct Persistence {
     checkpoints: Option<Checkpoints>,
     decisions: Option<DecisionLog>,
     recovery: Option<Recovery>,
+    folders: Vec<KeptFolder>,
     /// Evicted keyframes, without pixels, that the newest complete checkpoint may contain. The first
     /// `n_evicted_before_last` of them were evicted before the last checkpoint was started.
     evicted: Vec<Arc<Keyframe>>,
@@ -25,6 +27,21 @@ pub(super) struct Persistence {
 }
 
 impl Persistence {
+    /// Makes these folders again if they disappear.
+    pub(super) fn set_folders(&mut self, folders: Vec<KeptFolder>) {
+        self.folders = folders;
+    }
+
+    /// Checks the folders, at most once per second.
+    pub(super) fn check_folders_when_due(&mut self) {
+        self.folders.iter_mut().for_each(KeptFolder::check_when_due);
+    }
+
+    /// Checks the folders before the results are written.
+    pub(super) fn check_folders(&mut self) {
+        self.folders.iter_mut().for_each(KeptFolder::check);
+    }
+
     /// Enables checkpoints; `None` disables them.
     pub(super) fn set_checkpoints(&mut self, checkpoints: Option<Checkpoints>) {
         self.checkpoints = checkpoints;
@@ -239,8 +256,10 @@ fn resume(
     checkpoint: crate::Result<Checkpoint>,
     keyframes: &[Arc<Keyframe>],
 ) -> crate::Result<Option<Resumed>> {
-    match checkpoint.and_then(|checkpoint| Ok(trainer::resume(gpu.clone(), &checkpoint, keyframes)?)) {
-        Ok(resumed) => Ok(Some(resumed)),
+    // Keyframes that were missing at the start of this run are still missing.
+    let resume = |checkpoint| Ok(trainer::resume_without_missing(gpu.clone(), &checkpoint, keyframes)?);
+    match checkpoint.and_then(resume) {
+        Ok((resumed, _)) => Ok(Some(resumed)),
         Err(error) if error.is_gpu_error() => Err(error),
         Err(error) => {
             log::warn!("cannot resume from the newest checkpoint: {error:#}");

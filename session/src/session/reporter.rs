@@ -134,6 +134,11 @@ impl Reporter {
         std::mem::take(&mut self.evaluations)
     }
 
+    /// Reports how many test images have been scored at the end of training.
+    pub(super) fn report_scoring(&mut self, n_scored: usize, n_all: usize) {
+        self.observer.on_event(&SessionEvent::Scoring { n_scored, n_all });
+    }
+
     /// Reports that training ended.
     pub(super) fn report_training_ended(&mut self) {
         self.observer.on_event(&SessionEvent::TrainingEnded);

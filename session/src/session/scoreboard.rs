@@ -7,8 +7,11 @@ use keyframe::{Keyframe, Split};
 use kinematics::Stamp;
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
+use std::time::Duration;
 use trainer::Method;
 
+/// Maximum time of one scheduled evaluation.
+const MAX_EVALUATION: Duration = Duration::from_secs(60);
 /// Maximum number of points of the PSNR curve. When it is reached, every other point is removed.
 const MAX_HISTORY: usize = 512;
 
@@ -19,6 +22,9 @@ pub struct Evaluators {
     pub during_training: Evaluator,
     /// Maximum number of test keyframes in a scheduled evaluation, evenly spread. The final evaluation scores all.
     pub max_images_during_training: usize,
+    /// Maximum time of all scheduled evaluations, as a fraction of the training time. If they take longer, they score fewer
+    /// images, and some are left out. `None`: no limit.
+    pub max_frac_during_training: Option<f64>,
     /// Evaluator for the end of training.
     pub at_end: Evaluator,
 }
@@ -31,6 +37,8 @@ pub(super) struct Scoreboard {
     schedule: EvaluationSchedule,
     /// An evaluation that is due or in progress.
     pending: Option<PendingEvaluation>,
+    /// Time that the completed evaluations took.
+    spent: Duration,
     /// Whether the caller scores an evaluation image by image.
     is_stepwise: bool,
     /// Latest PSNR of each test keyframe, by camera and stamp.
@@ -46,6 +54,7 @@ impl Scoreboard {
             tests: VecDeque::new(),
             schedule: EvaluationSchedule::default(),
             pending: None,
+            spent: Duration::ZERO,
             is_stepwise: false,
             newest_psnr: BTreeMap::new(),
             history: Vec::new(),
@@ -96,10 +105,16 @@ impl Scoreboard {
         self.pending.is_none() && self.schedule.reached(secs)
     }
 
-    /// Begins an evaluation at this training time.
+    /// Begins an evaluation at this training time, unless the earlier ones have taken too long.
     pub(super) fn begin(&mut self, secs: f64) {
-        let max_images = self.evaluators.max_images_during_training;
-        self.pending = Some(PendingEvaluation::new(secs, self.tests.iter(), max_images));
+        let Evaluators { max_images_during_training, max_frac_during_training, .. } = self.evaluators;
+        let max_frac = max_frac_during_training.unwrap_or(f64::INFINITY);
+        let allowed = Duration::try_from_secs_f64(max_frac * secs).unwrap_or(Duration::MAX).saturating_sub(self.spent);
+        if !allowed.is_zero() {
+            let max_spent = allowed.min(MAX_EVALUATION);
+            let tests = self.tests.iter();
+            self.pending = Some(PendingEvaluation::new(secs, tests, max_images_during_training, max_spent));
+        }
     }
 
     /// Whether an evaluation is in progress.
@@ -122,9 +137,18 @@ impl Scoreboard {
         self.evaluators.during_training.score_named(method, keyframe)
     }
 
-    /// Scores all test keyframes at the end of training.
-    pub(super) fn score_all(&self, method: &mut dyn Method) -> crate::Result<Vec<ImageScores>> {
-        self.evaluators.at_end.score_all(method, self.tests.iter())
+    /// Records the time that an evaluation took.
+    pub(super) fn add_spent(&mut self, spent: Duration) {
+        self.spent += spent;
+    }
+
+    /// Scores all test keyframes at the end of training; see [`Evaluator::score_all`].
+    pub(super) fn score_all(
+        &self,
+        method: &mut dyn Method,
+        meanwhile: impl FnMut(&mut dyn Method, usize),
+    ) -> crate::Result<Vec<ImageScores>> {
+        self.evaluators.at_end.score_all(method, self.tests.iter(), meanwhile)
     }
 
     /// Returns the test keyframe with the oldest score and moves it to the end of the queue.
@@ -159,5 +183,43 @@ impl Scoreboard {
     /// The history of [`Self::psnr`]: training seconds and dB.
     pub(super) fn psnr_history(&self) -> &[(f64, f64)] {
         &self.history
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{Evaluators, Scoreboard};
+    use crate::evaluate::Evaluator;
+    use crate::evaluation_schedule::up_to;
+    use std::time::Duration;
+
+    fn evaluators(max_frac_during_training: Option<f64>) -> Evaluators {
+        let quick = Evaluator::psnr_only;
+        let max_images_during_training = usize::MAX;
+        Evaluators { during_training: quick(), max_images_during_training, max_frac_during_training, at_end: quick() }
+    }
+
+    /// Times of the evaluations up to 60 s of training, if each takes this long.
+    fn evaluated(max_frac: Option<f64>, each: Duration) -> Vec<f64> {
+        let mut scoreboard = Scoreboard::new(evaluators(max_frac));
+        let mut evaluated = Vec::new();
+        for secs in up_to(60.0) {
+            assert!(scoreboard.is_due(secs));
+            scoreboard.begin(secs);
+            if let Some(evaluation) = scoreboard.take_pending() {
+                evaluated.push(evaluation.seconds);
+                scoreboard.add_spent(each);
+            }
+        }
+        evaluated
+    }
+
+    #[test]
+    fn evaluations_take_a_bounded_share_of_the_time() {
+        let all: Vec<f64> = up_to(60.0).collect();
+        assert_eq!(evaluated(None, Duration::from_secs(100)), all);
+        assert_eq!(evaluated(Some(0.1), Duration::from_millis(20)), all);
+        assert_eq!(evaluated(Some(0.1), Duration::from_secs(1)), [0.25, 16.0, 32.0, 60.0]);
+        assert_eq!(evaluated(Some(0.1), Duration::from_secs(7)), [0.25], "one evaluation in any case");
     }
 }

@@ -105,7 +105,7 @@ fn test_keyframe(ix: u8) -> Arc<Keyframe> {
         size_px: SIZE_PX,
         focal_px: [4.0; 2],
         principal_px: [2.0, 1.0],
-        rgba_srgb: [100 + 10 * ix, 50, 50, 255].repeat(8).into(),
+        rgba_srgb: [100_u8.wrapping_add(ix.wrapping_mul(10)), 50, 50, 255].repeat(8).into(),
         depth: None,
         world_from_camera: Transform::identity(),
         twist: None,
@@ -125,6 +125,7 @@ fn session_with_evaluation_due(stop: &Stop) -> (Session, std::rc::Rc<std::cell::
     let evaluators = Evaluators {
         during_training: quick(),
         max_images_during_training: MAX_IMAGES_DURING_TRAINING,
+        max_frac_during_training: None,
         at_end: quick(),
     };
     let gpu = Gpu::open(&GpuOptions::default()).expect("an adapter");
@@ -170,6 +171,22 @@ fn stepwise_scoring_equals_scoring_at_once() {
 }
 
 #[test]
+fn scoring_in_parallel_equals_scoring_one_by_one() {
+    let tests: Vec<Arc<Keyframe>> = (0..50).map(test_keyframe).collect();
+    let mut method = Gray::default();
+    let mut reported = Vec::new();
+    let evaluator = Evaluator::psnr_only();
+    let at_once = evaluator.score_all(&mut method, tests.iter(), |_, n| reported.push(n)).expect("scored");
+    let one_by_one: Vec<_> = tests.iter().map(|test| evaluator.score(&mut method, test).expect("scored")).collect();
+    assert_eq!(at_once, one_by_one, "in the order of the images");
+    assert!(reported.is_sorted() && reported.last() == Some(&50), "{reported:?}");
+    let broken = Arc::new(Keyframe { rgba_srgb: [].into(), ..(*tests[7]).clone() });
+    let with_broken = [&tests[..7], &[broken], &tests[8..]].concat();
+    let error = evaluator.score_all(&mut method, with_broken.iter(), |_, _| {}).expect_err("an image has no pixels");
+    assert!(error.to_string().contains(&tests[7].stamp.0.to_string()), "{error:#}");
+}
+
+#[test]
 fn evaluation_is_dropped_when_stopping() {
     let stop = Stop::default();
     let (session, n_drawn) = session_with_evaluation_due(&stop);
@@ -187,7 +204,12 @@ fn size_search_ends_before_the_time_limit() {
         let method = Gray::default();
         let is_searching = method.is_searching.clone();
         let quick = Evaluator::psnr_only;
-        let evaluators = Evaluators { during_training: quick(), max_images_during_training: 1, at_end: quick() };
+        let evaluators = Evaluators {
+            during_training: quick(),
+            max_images_during_training: 1,
+            max_frac_during_training: None,
+            at_end: quick(),
+        };
         let limits = Limits { seconds: limit_secs, steps: Some(100) };
         let gpu = Gpu::open(&GpuOptions::default()).expect("an adapter");
         let mut session = Session::new(gpu, (ModelKind::default(), Box::new(method)), evaluators, limits, Box::new(()));

@@ -5,10 +5,10 @@ use crate::print;
 use calibration::{BoardPoint, BoardView};
 use capture::CalibrationImage;
 use image::ImageReader;
+use rayon::prelude::*;
 use session::calibration_report::{Photo, Photos, Unused};
 use std::io::BufReader;
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicUsize, Ordering};
 use targets::{Counts, Detection, GrayImage, TargetSpec};
 
 /// The target in one image.
@@ -108,24 +108,14 @@ pub(super) fn detect_each<T: Sync>(
     detect: impl Fn(&T) -> DetectedImage + Sync,
 ) -> Vec<DetectedImage> {
     let bar = print::bar(Some(images.len() as u64), "{bar:30} {pos} of {len} images", is_hidden);
-    let next = AtomicUsize::new(0);
-    let detect_some = || {
-        let mut detected = Vec::new();
-        loop {
-            let ix = next.fetch_add(1, Ordering::Relaxed);
-            let Some(image) = images.get(ix) else { return detected };
-            detected.push((ix, detect(image)));
-            bar.inc(1);
-        }
-    };
-    let n_threads = std::thread::available_parallelism().map_or(1, |n| n.get().min(images.len()));
-    let mut detected: Vec<_> = std::thread::scope(|scope| {
-        let threads: Vec<_> = (0..n_threads).map(|_| scope.spawn(detect_some)).collect();
-        threads.into_iter().flat_map(|thread| thread.join().expect("detection does not panic")).collect()
+    let detected = images.par_iter().map(|image| {
+        let detected = detect(image);
+        bar.inc(1);
+        detected
     });
+    let detected = detected.collect();
     bar.finish_and_clear();
-    detected.sort_by_key(|(ix, _)| *ix);
-    detected.into_iter().map(|(_, image)| image).collect()
+    detected
 }
 
 fn check_readable(images: &[DetectedImage]) -> Result<(), BadArgument> {

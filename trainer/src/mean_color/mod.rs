@@ -33,7 +33,9 @@ pub(crate) static ENTRY: MethodEntry = MethodEntry {
     default_options: default_options::<MeanColorOptions>,
     check_options: |options| options.typed::<MeanColorOptions>().map(drop),
     start: |gpu, options| Ok(Aligned::if_requested(MeanColor::new(options.typed()?), &options.common, &gpu)),
-    resume: |_, checkpoint, keyframes| Aligned::resume(checkpoint, keyframes, MeanColor::resume),
+    resume: |_, checkpoint, keyframes, placeholders| {
+        Aligned::resume(checkpoint, keyframes, placeholders, MeanColor::resume)
+    },
     load: |_, folder| Ok(Box::new(Aligned::load(MeanColor::load(folder)?, folder)?)),
 };
 

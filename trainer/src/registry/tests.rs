@@ -2,7 +2,7 @@
 
 use super::*;
 use crate::gpu::testing::test_gpu;
-use crate::{CommonOptions, ModelSpec, load, resume, test_scenes};
+use crate::{CommonOptions, ModelSpec, load, resume, resume_without_missing, test_scenes};
 use std::collections::BTreeSet;
 
 #[test]
@@ -62,6 +62,36 @@ fn removed_keyframe_is_not_needed_to_resume() {
         let checkpoint = model.checkpoint().unwrap().finish().unwrap();
         let resumed = resume(gpu.clone(), &checkpoint, &keyframes[1..]);
         assert!(resumed.is_ok(), "{kind:?}: {:?}", resumed.err());
+    }
+}
+
+/// A file of a keyframe may be damaged or deleted.
+#[test]
+fn every_method_resumes_without_missing_keyframes() {
+    let gpu = test_gpu();
+    let keyframes = test_scenes::ring(&[test_scenes::floor()], nalgebra::Point3::origin(), 6);
+    for kind in ModelKind::ALL {
+        let mut model = ModelSpec::new(*kind, CommonOptions::default(), &[]).unwrap().start(gpu.clone()).unwrap();
+        keyframes.iter().for_each(|keyframe| model.push(keyframe.clone()).unwrap());
+        while model.progress().step < 2 {
+            model.step(1).unwrap();
+        }
+        let checkpoint = model.checkpoint().unwrap().finish().unwrap();
+        let left = [&keyframes[..1], &keyframes[3..]].concat();
+        let error = resume(gpu.clone(), &checkpoint, &left).err().unwrap();
+        let expected = format!("2 of its images are missing, the first is image {}", keyframes[1].stamp.0);
+        assert!(error.to_string().contains(&expected), "{kind:?}: {error}");
+        let (mut resumed, missing) = resume_without_missing(gpu.clone(), &checkpoint, &left).unwrap();
+        let expected = [1, 2].map(|ix| (keyframes[ix].camera.clone(), keyframes[ix].stamp));
+        assert_eq!(missing, expected, "{kind:?}");
+        let n_before = resumed.method.progress().step;
+        for _ in 0..4 {
+            resumed.method.step(1).unwrap();
+        }
+        assert!(resumed.method.progress().step > n_before || resumed.method.is_idle(), "{kind:?}");
+        // A checkpoint of the resumed model does not need them.
+        let checkpoint = resumed.method.checkpoint().unwrap().finish().unwrap();
+        assert!(resume(gpu.clone(), &checkpoint, &left).is_ok(), "{kind:?}");
     }
 }
 

@@ -61,9 +61,10 @@ fn wrong_extrinsics_are_corrected_and_resuming_is_exact() {
     for end in [ALIGNMENT_STEP + 1, ALIGNMENT_STEP + 7, ALIGNMENT_STEP + 10] {
         let checkpoint = interrupted.checkpoint().unwrap().finish().unwrap();
         let untrained;
-        (interrupted, untrained) =
-            Aligned::resume(&checkpoint, &stored, |own, keyframes| SplatTrainer::resume(gpu.clone(), own, keyframes))
-                .unwrap();
+        (interrupted, untrained) = Aligned::resume(&checkpoint, &stored, &[], |own, keyframes| {
+            SplatTrainer::resume(gpu.clone(), own, keyframes)
+        })
+        .unwrap();
         for keyframe in untrained.into_iter().rev() {
             interrupted.push(keyframe).unwrap();
         }

@@ -128,6 +128,9 @@ impl SplatTrainer {
     /// Loads the camera corrections and the background of a saved model from its `model.json`.
     pub fn with_saved_metadata(mut self, folder: &Path) -> Result<Self, Error> {
         let metadata = read_metadata(folder)?;
+        for difference in metadata.differences(self.progress().primitives, self.options.specific.sh_degree) {
+            log::warn!("{}: {difference}", folder.display());
+        }
         (self.saved_corrections, self.saved_background_srgb) = (metadata.cameras, metadata.background_srgb);
         Ok(self)
     }

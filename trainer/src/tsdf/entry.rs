@@ -52,8 +52,13 @@ fn start(gpu: Arc<Gpu>, options: &ModelOptions) -> Result<Box<dyn Method>, Error
     Ok(Aligned::if_requested(model, &options.common, &gpu))
 }
 
-fn resume(gpu: Arc<Gpu>, checkpoint: &Checkpoint, keyframes: &[Arc<Keyframe>]) -> Result<ResumedModel, Error> {
-    Aligned::resume(checkpoint, keyframes, |own_checkpoint, keyframes| {
+fn resume(
+    gpu: Arc<Gpu>,
+    checkpoint: &Checkpoint,
+    keyframes: &[Arc<Keyframe>],
+    placeholders: &[Arc<Keyframe>],
+) -> Result<ResumedModel, Error> {
+    Aligned::resume(checkpoint, keyframes, placeholders, |own_checkpoint, keyframes| {
         TsdfModel::resume(gpu, own_checkpoint, keyframes)
     })
 }

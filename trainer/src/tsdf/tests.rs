@@ -387,7 +387,7 @@ fn resume_is_bit_exact() {
         TsdfModel::resume(gpu(), checkpoint, keyframes).map(drop).unwrap_err().to_string()
     };
     let checkpoint = checkpoint_of(&mut parts);
-    assert!(refused(&checkpoint, &keyframes[1..]).contains("image 0 of camera \"test\" is missing"));
+    assert!(refused(&checkpoint, &keyframes[1..]).contains("the first is image 0 of camera \"test\""));
     let broken = |change: &dyn Fn(&mut Checkpoint)| {
         let mut other = checkpoint.clone();
         change(&mut other);

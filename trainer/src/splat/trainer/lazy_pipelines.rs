@@ -3,8 +3,8 @@
 use crate::Error;
 use crate::gpu::Gpu;
 use crate::splat::kernels::TrainPipelines;
+use background::Task;
 use std::sync::Arc;
-use std::thread::JoinHandle;
 
 /// Compilation state of the training pipelines.
 #[derive(Debug)]
@@ -19,11 +19,11 @@ pub(super) enum LazyPipelines {
 /// A thread that compiles the pipelines. Drop waits for the thread, because NVIDIA's driver corrupts the heap if the
 /// process exits during compilation.
 #[derive(Debug)]
-pub(super) struct Compiling(Option<JoinHandle<Result<TrainPipelines, Error>>>);
+pub(super) struct Compiling(Option<Task<Result<Box<TrainPipelines>, Error>>>);
 
 impl Compiling {
-    fn finish(&mut self, gpu: &Gpu) -> Result<TrainPipelines, Error> {
-        let finished = self.0.take().map(JoinHandle::join);
+    fn finish(&mut self, gpu: &Gpu) -> Result<Box<TrainPipelines>, Error> {
+        let finished = self.0.take().map(Task::join);
         let Some(Ok(compiled)) = finished else {
             return Err(gpu.failure_or("the thread that compiles the pipelines panicked"));
         };
@@ -43,7 +43,7 @@ impl LazyPipelines {
     /// Starts compiling on another thread.
     pub(super) fn start(gpu: &Arc<Gpu>) -> Self {
         let gpu = gpu.clone();
-        Self::Compiling(Compiling(Some(std::thread::spawn(move || TrainPipelines::new(&gpu)))))
+        Self::Compiling(Compiling(Some(Task::start("pipelines", move || TrainPipelines::new(&gpu).map(Box::new)))))
     }
 
     /// Waits for the pipelines, or compiles them on first use.
@@ -52,7 +52,7 @@ impl LazyPipelines {
             return Ok(ready.clone());
         }
         let ready = Arc::new(match std::mem::replace(self, Self::Failed) {
-            Self::Compiling(mut thread) => thread.finish(gpu)?,
+            Self::Compiling(mut thread) => *thread.finish(gpu)?,
             Self::OnDemand => TrainPipelines::new(gpu)?,
             Self::Ready(_) | Self::Failed => {
                 return Err(gpu.failure_or("a step was requested although its pipelines could not be compiled"));

@@ -1,0 +1,107 @@
+//! A file or folder of this program that somebody may remove or rename while it is in use.
+
+use std::fs::{File, Metadata};
+use std::io::ErrorKind;
+use std::os::fd::AsRawFd;
+use std::os::unix::fs::MetadataExt;
+use std::path::{Path, PathBuf};
+
+/// A file or folder that is kept open, so that its contents remain until this value is dropped.
+#[derive(Debug)]
+pub struct Kept {
+    path: PathBuf,
+    file: File,
+}
+
+/// Where a kept file or folder is now.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Place {
+    /// At its path.
+    Here,
+    /// At this path.
+    MovedTo(PathBuf),
+    /// Removed, or moved to an unknown place.
+    Removed,
+}
+
+impl Kept {
+    /// Opens a file or folder for reading.
+    ///
+    /// # Errors
+    /// If it cannot be opened.
+    pub fn open(path: &Path) -> std::io::Result<Self> {
+        Ok(Self { path: path.to_owned(), file: File::open(path)? })
+    }
+
+    /// The path at which it was opened.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Where it is now.
+    pub fn place(&self) -> Place {
+        let is_this = |metadata: Metadata| {
+            self.file.metadata().is_ok_and(|own| (own.dev(), own.ino()) == (metadata.dev(), metadata.ino()))
+        };
+        if self.path.metadata().is_ok_and(is_this) {
+            return Place::Here;
+        }
+        // Only Linux tells the path of an open file. After a removal, it ends with a note instead of a name.
+        let now = std::fs::read_link(self.in_proc());
+        let moved = now.ok().filter(|now| now.metadata().is_ok_and(is_this));
+        moved.map_or(Place::Removed, Place::MovedTo)
+    }
+
+    /// Writes the contents of a removed file to its path again, unless something else is there.
+    ///
+    /// # Errors
+    /// If it cannot be written, or if the path is taken.
+    pub fn restore(&self) -> std::io::Result<()> {
+        // Opened again, because the position of `file` may be shared.
+        let mut contents = match File::open(self.in_proc()) {
+            Err(error) if error.kind() == ErrorKind::NotFound => self.file.try_clone()?,
+            opened => opened?,
+        };
+        crate::create(&self.path, |file| std::io::copy(&mut contents, file).map(drop))
+    }
+
+    fn in_proc(&self) -> PathBuf {
+        format!("/proc/self/fd/{}", self.file.as_raw_fd()).into()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{Kept, Place};
+    use std::fs;
+
+    #[test]
+    fn removed_file_is_restored_with_what_was_written_since() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("scan");
+        let mut writer = crate::begin(&path).expect("a new file");
+        let kept = Kept::open(&path).expect("it exists");
+        assert_eq!(kept.place(), Place::Here);
+        fs::remove_file(&path).expect("it exists");
+        std::io::Write::write_all(&mut writer, b"written later").expect("space");
+        assert_eq!(kept.place(), Place::Removed);
+        fs::write(&path, "other").expect("space");
+        assert_eq!(kept.place(), Place::Removed, "another file has its name");
+        assert!(kept.restore().is_err(), "the other file stays");
+        fs::remove_file(&path).expect("it exists");
+        kept.restore().expect("space");
+        assert_eq!(fs::read_to_string(&path).expect("it is there"), "written later");
+    }
+
+    #[test]
+    fn new_name_of_a_folder_is_found() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let [old, new] = ["old", "new"].map(|name| folder.path().join(name));
+        fs::create_dir(&old).expect("space");
+        let kept = Kept::open(&old).expect("it exists");
+        fs::rename(&old, &new).expect("it exists");
+        assert_eq!(kept.place(), Place::MovedTo(new.canonicalize().expect("it exists")));
+        fs::remove_dir(&new).expect("it is empty");
+        assert_eq!(kept.place(), Place::Removed);
+    }
+}
