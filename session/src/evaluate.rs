@@ -171,7 +171,7 @@ impl Evaluator {
         mut meanwhile: impl FnMut(&mut dyn Method, usize),
     ) -> crate::Result<Vec<ImageScores>> {
         let max_waiting = 2 * rayon::current_num_threads();
-        let (sender, receiver) = std::sync::mpsc::channel();
+        let (sender, receiver) = std::sync::mpsc::sync_channel(max_waiting);
         let mut scored: Vec<(usize, ImageScores)> = Vec::new();
         let all: crate::Result<()> = rayon::in_place_scope(|scope| {
             let mut n_drawn = 0;

@@ -149,10 +149,31 @@ fn splat_files_of_other_programs() {
     assert!(covered("rgb_mode") > 10 && covered("2dgs") > 10);
     let (code, printed) = render("splats_headers/points3D.ply", "points");
     assert!(code == Some(1) && printed.contains("it is a point cloud or a mesh"), "{printed}");
+    let truth = image::open(case.at("splats_antialiased/reference_mip.png")).unwrap().into_rgb8();
+    let render_mip = |file: &str, out: &str| {
+        let (code, printed) = render(file, out);
+        assert_eq!(code, Some(0), "{printed}");
+        psnr(&picture(out), &truth)
+    };
     for file in ["mip.ply", "mip.spz"] {
-        let (code, printed) = render(&format!("splats_antialiased/{file}"), file);
-        assert!(code == Some(0) && printed.contains("Mip-Splatting"), "{printed}");
+        let quality = render_mip(&format!("splats_antialiased/{file}"), file);
+        assert!(quality > 35.0, "{file}: {quality} dB");
+        // The flag is kept in both formats.
+        for format in ["ply", "spz"] {
+            let exported = format!("{file}.{format}");
+            let (code, printed) =
+                case.run(&["export", &format!("splats_antialiased/{file}"), "--to", format, "--out", &exported]);
+            assert_eq!(code, Some(0), "{printed}");
+            let quality = render_mip(&exported, &format!("from-{exported}"));
+            assert!(quality > 35.0, "{exported}: {quality} dB");
+        }
     }
+}
+
+fn psnr(one: &image::RgbImage, other: &image::RgbImage) -> f64 {
+    assert_eq!(one.dimensions(), other.dimensions());
+    let squares = one.iter().zip(other.iter()).map(|(a, b)| (f64::from(*a) - f64::from(*b)).powi(2));
+    -10.0 * (squares.sum::<f64>() / one.len() as f64 / 255_f64.powi(2)).log10()
 }
 
 #[test]

@@ -70,6 +70,8 @@ pub enum ChunkLayout {
         sh_degree: u32,
         /// Largest coefficients of degree 1 and 2.
         sh_ranges: [f32; 2],
+        /// Whether opacities are lowered where the low-pass enlarges splats.
+        is_antialiased: bool,
     },
 }
 

@@ -33,6 +33,9 @@ pub struct Resumed {
     pub edits: Edits,
 }
 
+/// Camera and stamp of a keyframe.
+pub type KeyframeId = (Arc<str>, Stamp);
+
 /// A saved model in GPU memory.
 pub struct LoadedModel {
     /// The method.
@@ -114,7 +117,7 @@ pub fn resume_without_missing(
     gpu: Arc<Gpu>,
     checkpoint: &Checkpoint,
     keyframes: &[Arc<Keyframe>],
-) -> Result<(Resumed, Vec<(Arc<str>, Stamp)>), Error> {
+) -> Result<(Resumed, Vec<KeyframeId>), Error> {
     let placeholders = match resume_with(gpu.clone(), checkpoint, keyframes, &[]) {
         Ok(resumed) => return Ok((resumed, Vec::new())),
         Err(Error::MissingKeyframes { placeholders }) => placeholders,

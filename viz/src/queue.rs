@@ -364,7 +364,7 @@ mod tests {
         queue.view_request(other, view_request(5));
         assert_eq!(queue.take().expect("a small picture always fits").client, other);
         queue.release(viewers[0]);
-        assert_eq!(queue.take().expect("there is room again").client, viewers[10]);
+        assert!(viewers.contains(&queue.take().expect("there is room again").client));
     }
 
     #[test]

@@ -88,6 +88,7 @@ pub(crate) mod tests {
             scale_factor: 1.0,
             sh_degree: 0,
             sh_ranges: [0.0; 2],
+            is_antialiased: false,
         }
     }
 

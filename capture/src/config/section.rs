@@ -109,12 +109,7 @@ impl ParseContext {
     }
 }
 
-fn note_lines(
-    line_of: &impl Fn(usize) -> usize,
-    table: &DeTable<'_>,
-    path: &str,
-    lines: &mut BTreeMap<String, usize>,
-) {
+fn note_lines(line_of: &impl Fn(usize) -> usize, table: &DeTable<'_>, path: &str, lines: &mut BTreeMap<String, usize>) {
     for (key, value) in table {
         let path = join(path, key.get_ref());
         lines.insert(path.clone(), line_of(key.span().start));

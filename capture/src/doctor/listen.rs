@@ -14,6 +14,9 @@ use std::time::{Duration, Instant};
 /// A device is reported if its rate is below this fraction of the rate in the rig file.
 const MIN_RATE_FRAC: f64 = 0.95;
 
+/// Shorter spans are too uncertain to compare stamps with time.
+const MIN_RECEIVED_SECS: f64 = 0.5;
+
 /// Measurements of one device, or of the keyframes made from its images.
 #[derive(Debug, PartialEq, Serialize)]
 pub struct DeviceStatistics {
@@ -32,6 +35,8 @@ pub struct DeviceStatistics {
     pub latency: Option<Latency>,
     /// 99th percentile of the intervals between samples.
     pub gap_p99_millis: f64,
+    /// Time by which the stamps advance per second; `None` for simulated devices, and with few samples.
+    pub stamp_secs_per_sec: Option<f64>,
 }
 
 /// Time from the stamp of a sample until the program receives it.
@@ -59,6 +64,8 @@ pub struct ListenResult {
 struct Track {
     stamps: Vec<Stamp>,
     latency_millis: Vec<f64>,
+    /// When the first and the last sample arrived.
+    received: Option<[Stamp; 2]>,
     dropped: u64,
 }
 
@@ -66,6 +73,7 @@ impl Track {
     fn note(&mut self, stamp: Stamp, now: Stamp) {
         self.stamps.push(stamp);
         self.latency_millis.push(now.secs_since(stamp) * 1e3);
+        self.received = Some([self.received.map_or(now, |[first, _]| first), now]);
     }
 
     fn summarize(mut self, device: String, expected_hz: Option<f64>, is_simulated: bool) -> DeviceStatistics {
@@ -88,6 +96,11 @@ impl Track {
                 latency_max_millis: quantile_of(&mut self.latency_millis, 1.0),
             }),
             gap_p99_millis: quantile_of(&mut gaps, 0.99),
+            stamp_secs_per_sec: self
+                .received
+                .map(|[first, last]| last.secs_since(first))
+                .filter(|received_secs| !is_simulated && *received_secs >= MIN_RECEIVED_SECS)
+                .map(|received_secs| span_secs / received_secs),
         }
     }
 }
@@ -145,6 +158,7 @@ pub fn listen(rig: &Rig, secs: f64, stop: &Stop) -> Result<ListenResult> {
         })
         .collect();
     findings.extend(devices.iter().filter_map(problem));
+    findings.extend(devices.iter().filter_map(wrong_unit));
     let rejected: Vec<_> = join.counts().rejected.iter().map(|(why, n)| format!("{n} {}", why.name())).collect();
     let n_posed = join.counts().images - join.counts().rejected.get(&Rejection::NoPose).copied().unwrap_or(0);
     if !rejected.is_empty() {
@@ -212,6 +226,16 @@ fn problem(statistics: &DeviceStatistics) -> Option<Finding> {
     Some(Finding::warn("rate", message, "usual causes: low light with automatic exposure, a slow bus, a busy CPU"))
 }
 
+/// Reports stamps that advance faster or slower than time, usually because they are in another unit.
+fn wrong_unit(statistics: &DeviceStatistics) -> Option<Finding> {
+    let rate = statistics.stamp_secs_per_sec.filter(|rate| !(0.5..2.0).contains(rate))?;
+    let units = [("microseconds", 1e-3), ("milliseconds", 1e-6), ("seconds", 1e-9)];
+    let unit = units.into_iter().find(|(_, of_unit)| (0.5..2.0).contains(&(rate / of_unit)));
+    let guess = unit.map_or(String::new(), |(unit, _)| format!(", as if they were in {unit}"));
+    let message = format!("{}: its stamps advance by {rate:.1e} s per second{guess}", statistics.device);
+    Some(Finding::fail("stamps", message, "send stamps in nanoseconds, of one clock"))
+}
+
 impl std::fmt::Display for DeviceStatistics {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         let Self { device, samples, rate_hz, latency, gap_p99_millis, dropped, .. } = self;
@@ -255,6 +279,15 @@ mod tests {
         assert!(problem(&slow).is_some_and(|finding| finding.message.contains("expected 15.0 Hz")));
         let lossy = track(301, 100, 4).summarize("camera \"wrist\"".into(), Some(10.0), false);
         assert!(problem(&lossy).is_some_and(|finding| finding.message.contains("dropped 4 images")));
+        for (nanos_per_sample, expected) in [(1e5, "microseconds"), (100.0, "milliseconds"), (3e7, "3.0e-1 s per second")] {
+            let mut track = Track::default();
+            for ix in 0..21_i64 {
+                track.note(Stamp((ix as f64 * nanos_per_sample) as i64), Stamp(ix * 100_000_000));
+            }
+            let finding = wrong_unit(&track.summarize("arm".into(), None, false)).expect("not nanoseconds");
+            assert!(finding.message.contains(expected), "{}", finding.message);
+        }
+        assert_eq!(wrong_unit(&lossy), None);
         let nothing = Track::default().summarize("arm".into(), None, true);
         assert_eq!((nothing.rate_hz, &nothing.latency), (0.0, &None));
         assert!(!nothing.to_string().contains("latency"), "{nothing}");

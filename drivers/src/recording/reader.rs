@@ -8,11 +8,14 @@ use super::records::{self, RawRecord, ReadError, Records};
 use super::topic::{JOINT_NAMES, Topic};
 use crate::wire::{Malformed, foxglove, joint_state, point_cloud};
 use crate::{BasePose, Error, Image, Sample, Source, TruthImage};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;
 use std::io::{BufReader, Read};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+
+/// Maximum number of unused topics that are reported.
+const MAX_UNUSED_TOPICS: usize = 50;
 
 /// A recording that is being replayed: a [`Source`] of its samples in recorded order.
 #[derive(Debug)]
@@ -23,6 +26,9 @@ pub struct Recording {
     channels: BTreeMap<u16, Channel>,
     attachments: BTreeMap<String, Vec<u8>>,
     joint_names: Option<Vec<String>>,
+    names: Names,
+    /// Topics of other programs.
+    unused_topics: BTreeSet<String>,
     /// Parts of a ground-truth sample that is not complete yet.
     true_color: Option<Image>,
     true_depth_m: Option<Arc<[f32]>>,
@@ -60,6 +66,8 @@ impl Recording {
             channels: BTreeMap::new(),
             attachments: BTreeMap::new(),
             joint_names: None,
+            names: Names::default(),
+            unused_topics: BTreeSet::new(),
             true_color: None,
             true_depth_m: None,
             first: None,
@@ -144,6 +152,10 @@ impl Recording {
                     }
                     let schema_name = self.schemas.get(&schema_id).cloned().unwrap_or_default();
                     self.channels.insert(id, Channel { topic, topic_name: topic_name.to_owned(), schema_name });
+                } else if self.unused_topics.len() < MAX_UNUSED_TOPICS
+                    && self.unused_topics.insert(topic_name.to_owned())
+                {
+                    log::info!("topic {topic_name:?} of {} is not used", self.path.display());
                 }
             }
             Record::Attachment { name, data } => {
@@ -164,9 +176,13 @@ impl Recording {
     }
 
     fn decode(&mut self, channel: &Channel, data: &[u8]) -> Result<Option<Sample>, Malformed> {
-        let image = || foxglove::decode_image(&channel.schema_name, data);
+        let mut image = |camera: &str| {
+            let mut image = foxglove::decode_image(&channel.schema_name, data)?;
+            self.names.agree(&channel.topic_name, camera, &mut image.camera);
+            Ok::<_, Malformed>(image)
+        };
         Ok(Some(match &channel.topic {
-            Topic::Color(_) | Topic::Depth(_) => Sample::Image(image()?),
+            Topic::Color(camera) | Topic::Depth(camera) => Sample::Image(image(camera)?),
             Topic::Joints => Sample::Joints(joint_state::decode(data)?),
             Topic::Base => {
                 let (stamp, world_from_base) = foxglove::decode_transform(data)?;
@@ -176,10 +192,14 @@ impl Recording {
                 let (stamp, world_from_base) = foxglove::decode_transform(data)?;
                 Sample::BaseTruth(BasePose { stamp, world_from_base })
             }
-            Topic::Range(_) => Sample::Range(point_cloud::decode(data)?),
+            Topic::Range(scanner) => {
+                let mut scan = point_cloud::decode(data)?;
+                self.names.agree(&channel.topic_name, scanner, &mut scan.scanner);
+                Sample::Range(scan)
+            }
             Topic::Calibration(_) => return Ok(None),
-            Topic::TrueColor(_) => {
-                self.true_color = Some(image()?);
+            Topic::TrueColor(camera) => {
+                self.true_color = Some(image(camera)?);
                 return Ok(None);
             }
             Topic::TrueDepth(_) => {
@@ -196,11 +216,48 @@ impl Recording {
     }
 }
 
+/// Names of devices in topics and in the messages of these topics.
+#[derive(Debug, Default)]
+struct Names {
+    /// Topics of which a difference was reported.
+    reported: BTreeSet<String>,
+}
+
+impl Names {
+    /// Replaces the name in a message by that in its topic, which counts, and reports the first difference of each topic.
+    fn agree(&mut self, topic: &str, in_topic: &str, in_message: &mut Arc<str>) {
+        if **in_message == *in_topic {
+            return;
+        }
+        if self.reported.insert(topic.to_owned()) {
+            log::warn!("the messages of topic {topic:?} have the frame_id {in_message:?}; the name in the topic counts");
+        }
+        *in_message = in_topic.into();
+    }
+}
+
 impl Source for Recording {
     fn next_sample(&mut self) -> Result<Option<Sample>, Error> {
         match self.first.take() {
             Some(sample) => Ok(Some(sample)),
             None => self.read_sample(),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::Names;
+    use std::sync::Arc;
+
+    #[test]
+    fn name_in_the_topic_counts() {
+        let mut names = Names::default();
+        for in_message in ["wrist", "left", ""] {
+            let mut name: Arc<str> = in_message.into();
+            names.agree("/camera/left/color", "left", &mut name);
+            assert_eq!(&*name, "left");
+        }
+        assert_eq!(names.reported.len(), 1, "each topic is reported once");
     }
 }

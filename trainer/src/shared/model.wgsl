@@ -5,6 +5,10 @@ struct Model {
     capacity: u32,     // stride between the planes of sh_rest
     sh_degree: u32,    // degrees in use, 0 to 3
     n_sh_rest: u32,    // planes of sh_rest in use: 3 ((sh_degree + 1)^2 - 1)
+    is_antialiased: u32, // whether opacities are corrected for the low-pass
+    unused_0: u32,
+    unused_1: u32,
+    unused_2: u32,
 }
 
 // Inputs of rasterization for one visible splat.

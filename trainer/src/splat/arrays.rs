@@ -25,6 +25,9 @@ pub struct SplatArrays {
     pub sh: Vec<[f32; 3]>,
     /// Degree of the spherical harmonics, 0 to 3.
     pub sh_degree: u32,
+    /// Whether opacities are lowered where the low-pass enlarges splats, as in Mip-Splatting (Yu et al. 2024, equation 12),
+    /// with which other programs can train. Splats that are trained here are not.
+    pub is_antialiased: bool,
 }
 
 impl SplatArrays {
@@ -44,6 +47,7 @@ impl SplatArrays {
     ///     opacity_logits: vec![2.0],
     ///     sh: vec![[0.5, 0.1, 0.1]],
     ///     sh_degree: 0,
+    ///     is_antialiased: false,
     /// };
     /// assert_eq!(one.checked()?.n_splats(), 1);
     /// # Ok::<(), trainer::Error>(())
@@ -128,6 +132,7 @@ impl SplatArrays {
             opacity_logits: kept.iter().map(|ix| self.opacity_logits[*ix]).collect(),
             sh: kept.iter().flat_map(|ix| self.sh[ix * n_coeffs..(ix + 1) * n_coeffs].iter().copied()).collect(),
             sh_degree: self.sh_degree,
+            is_antialiased: self.is_antialiased,
         }
     }
 
@@ -184,6 +189,7 @@ mod tests {
             opacity_logits: vec![0.0, 2.0],
             sh: vec![[0.1; 3]; 8],
             sh_degree: 1,
+            is_antialiased: false,
         }
     }
 

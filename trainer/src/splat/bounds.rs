@@ -28,6 +28,7 @@ mod tests {
             opacity_logits: points.iter().map(|(_, logit)| *logit).collect(),
             sh: vec![[0.0; 3]; points.len()],
             sh_degree: 0,
+            is_antialiased: false,
         }
     }
 

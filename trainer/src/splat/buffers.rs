@@ -39,6 +39,8 @@ pub(crate) struct SplatBuffers {
     pub(crate) capacity: u32,
     pub(crate) sh_degree: u32,
     active_degree: u32,
+    /// See [`SplatArrays::is_antialiased`].
+    is_antialiased: bool,
     pub(crate) model: Buffer,
     pub(crate) means: Buffer,
     pub(crate) rotations: Buffer,
@@ -57,13 +59,21 @@ impl SplatBuffers {
         let capacity = capacity.max(1);
         let n = u64::from(capacity);
         let rest = u64::from(n_sh_rest(sh_degree)).max(1);
-        let model = Model { n_splats: 0, capacity, sh_degree, n_sh_rest: n_sh_rest(sh_degree) };
+        let sizes = Model {
+            n_splats: 0,
+            capacity,
+            sh_degree,
+            n_sh_rest: n_sh_rest(sh_degree),
+            is_antialiased: 0,
+            unused: [0; 3],
+        };
         Ok(Self {
             n_splats: 0,
             capacity,
             sh_degree,
             active_degree: sh_degree,
-            model: gpu.uniform_with("splat.model", &model),
+            is_antialiased: false,
+            model: gpu.uniform_with("splat.model", &sizes),
             means: gpu.storage("splat.means", 16 * n)?,
             rotations: gpu.storage("splat.rotations", 16 * n)?,
             shapes: gpu.storage("splat.shapes", 16 * n)?,
@@ -97,6 +107,7 @@ impl SplatBuffers {
         }
         copies.submit(gpu);
         larger.active_degree = self.active_degree.min(sh_degree);
+        larger.is_antialiased = self.is_antialiased;
         larger.set_n_splats(gpu, self.n_splats);
         Ok(larger)
     }
@@ -122,11 +133,18 @@ impl SplatBuffers {
 
     fn write_model(&self, gpu: &Gpu) {
         let (sh_degree, n_sh_rest) = (self.active_degree, n_sh_rest(self.active_degree));
-        let model = Model { n_splats: self.n_splats, capacity: self.capacity, sh_degree, n_sh_rest };
-        gpu.write(&self.model, 0, bytemuck::bytes_of(&model));
+        let sizes = Model {
+            n_splats: self.n_splats,
+            capacity: self.capacity,
+            sh_degree,
+            n_sh_rest,
+            is_antialiased: self.is_antialiased.into(),
+            unused: [0; 3],
+        };
+        gpu.write(&self.model, 0, bytemuck::bytes_of(&sizes));
     }
 
-    /// Appends splats; the caller must reserve capacity. Drops coefficients above this model's degree, and sets missing
+    /// Appends splats, all of which are then drawn as the last ones say; the caller must reserve capacity. Drops coefficients above this model's degree, and sets missing
     /// coefficients to zero.
     pub(crate) fn append(&mut self, gpu: &Gpu, arrays: &SplatArrays) {
         let first = u64::from(self.n_splats);
@@ -162,13 +180,15 @@ impl SplatBuffers {
             zeros.submit(gpu);
         }
         let n_new = u32::try_from(n_new).expect("the caller ensured a capacity that fits into u32");
+        self.is_antialiased = arrays.is_antialiased;
         self.set_n_splats(gpu, self.n_splats + n_new);
     }
 
     /// Reads the parameters back.
     pub(crate) fn read(&self, gpu: &Gpu) -> Result<SplatArrays, Error> {
         if self.n_splats == 0 {
-            return Ok(SplatArrays { sh_degree: self.sh_degree, ..SplatArrays::default() });
+            let (sh_degree, is_antialiased) = (self.sh_degree, self.is_antialiased);
+            return Ok(SplatArrays { sh_degree, is_antialiased, ..SplatArrays::default() });
         }
         self.begin_read(gpu, self.sh_degree).finish(gpu)
     }
@@ -187,6 +207,7 @@ impl SplatBuffers {
             n,
             stride,
             sh_degree,
+            is_antialiased: self.is_antialiased,
         }
     }
 
@@ -234,12 +255,13 @@ pub(crate) struct PendingSplats {
     n: usize,
     stride: usize,
     sh_degree: u32,
+    is_antialiased: bool,
 }
 
 impl PendingSplats {
     /// Waits for the parameters.
     pub(crate) fn finish(self, gpu: &Gpu) -> Result<SplatArrays, Error> {
-        let Self { n, stride, sh_degree, .. } = self;
+        let Self { n, stride, sh_degree, is_antialiased, .. } = self;
         let means: Vec<[f32; 4]> = self.means.finish(gpu)?;
         let rotations_wxyz: Vec<[f32; 4]> = self.rotations.finish(gpu)?;
         let shapes: Vec<[f32; 4]> = self.shapes.finish(gpu)?;
@@ -266,6 +288,7 @@ impl PendingSplats {
             opacity_logits: shapes.iter().map(|shape| shape[3]).collect(),
             sh,
             sh_degree,
+            is_antialiased,
         })
     }
 }

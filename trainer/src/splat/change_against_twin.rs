@@ -212,6 +212,7 @@ fn dead_splats_have_no_children() {
         opacity_logits: is_dead.iter().map(|is_dead| if *is_dead { -9.0 } else { 1.0 }).collect(),
         sh: vec![[0.0; 3]; n],
         sh_degree: 0,
+        is_antialiased: false,
     };
     let errors: Vec<f32> = (0..n).map(|_| f32_of(random.uniform(0.5, 1.0))).collect();
     let mut fixture = KernelFixture::new(&GpuOptions::default(), &scene::tilted_view(), &arrays);

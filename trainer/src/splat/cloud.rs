@@ -106,6 +106,7 @@ pub fn load_cloud_npz(path: &Path) -> Result<SplatArrays, Error> {
             opacity_logits: rows::<1>(&mut file, "opacities_logit", &[])?.concat(),
             sh: rows(&mut file, "sh", &[N_COEFFICIENTS as u64, 3])?,
             sh_degree: SH_DEGREE,
+            is_antialiased: false,
         })
     };
     read().map_err(|error| Error::SplatFile { path: path.to_owned(), reason: error.to_string() })?.checked()

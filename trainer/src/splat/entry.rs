@@ -101,6 +101,7 @@ mod tests {
             opacity_logits: vec![1.0; n_splats],
             sh: vec![[0.1; 3]; n_splats],
             sh_degree: 0,
+            is_antialiased: false,
         };
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("large.ply");

@@ -351,7 +351,7 @@ mod tests {
                 crop_max
             ]
         );
-        assert_layout!(KERNELS, Model, [n_splats, capacity, sh_degree, n_sh_rest]);
+        assert_layout!(KERNELS, Model, [n_splats, capacity, sh_degree, n_sh_rest, is_antialiased]);
         assert_layout!(
             KERNELS,
             Rule,

@@ -56,7 +56,3 @@ pub use trainer::SplatTrainer;
 pub use trial_steps::TrialSteps;
 pub use trials::CountPolicy;
 pub use work_counts::WorkCounts;
-
-/// Note about files that were trained with the opacity correction of Mip-Splatting.
-const ANTIALIASED: &str = "its splats were trained with the antialiasing of Mip-Splatting, which fieldrig does not apply: \
-    small and distant splats are drawn too opaque";

@@ -10,6 +10,8 @@ pub(crate) struct Model {
     pub(crate) capacity: u32,
     pub(crate) sh_degree: u32,
     pub(crate) n_sh_rest: u32,
+    pub(crate) is_antialiased: u32,
+    pub(crate) unused: [u32; 3],
 }
 
 /// `Capacity` of shared/capacity.wgsl.

@@ -5,7 +5,7 @@
 // writes    projected_splats [n_splats], depth_keys [n_splats] (all ones if invisible), status (smallest and largest depth)
 // twin      splat/reference/project.rs
 // source    Zwicker et al. 2001 (EWA volume splatting); Kerbl et al. 2023, section 4; dropping of splats during training:
-//           Park et al. 2025 (DropGaussian)
+//           Park et al. 2025 (DropGaussian); correction of opacities: Yu et al. 2024 (Mip-Splatting), equation 12
 
 #import view
 #import model
@@ -52,7 +52,9 @@ fn project(splat_ix: u32) -> u32 {
     let projection = project_splat(view, mean, rotations[splat_ix], shape.xyz);
     // The remaining splats become more opaque, so that the picture keeps its mean opacity.
     let drop_frac = bitcast<f32>(atomicLoad(&status[DROP_FRAC]));
-    let opacity = sigmoid(shape.w) / (1.0 - drop_frac);
+    var opacity = sigmoid(shape.w) / (1.0 - drop_frac);
+    // The low-pass enlarges the splat; a model with this flag keeps the product of opacity and area.
+    if model.is_antialiased != 0u { opacity *= projection.narrowness; }
     // These comparisons are false for NaN, so a splat with a NaN is invisible.
     let visible = projection.visible && opacity > MIN_ALPHA && projection.determinant > 0.0 && inside_crop(view, mean)
         && abs(projection.mean_px.x) < 1e6 && abs(projection.mean_px.y) < 1e6 && projection.covariance.x + projection.covariance.z < 1e12;

@@ -487,6 +487,7 @@ fn both_chunks() -> Vec<ModelChunk> {
         scale_factor: 1.0,
         sh_degree: 0,
         sh_ranges: [0.0; 2],
+        is_antialiased: false,
     };
     let chunk = |(id, layout)| {
         let fine = ChunkData { layout, bytes: Vec::new() };

@@ -294,6 +294,7 @@ export interface SplatChunkHeader extends ChunkHeader {
   scale_factor: number;
   sh_degree: number;
   sh_ranges: [number, number];
+  is_antialiased: boolean;
 }
 
 export type ModelChunkHeader = MeshChunkHeader | SplatChunkHeader;

@@ -64,7 +64,7 @@ export class SplatMemory {
       log_scale_range[0],
       (log_scale_range[1] - log_scale_range[0]) / 255,
       ...sh_ranges.map((range) => (hasHarmonics ? range / MAX_SH_COUNT : 0)),
-      1,
+      header.is_antialiased ? 2 : 1,
     ];
     units.forEach((unit, ix) => {
       const [begin, end] = [ix * UNIT_WORDS, Math.min((ix + 1) * UNIT_WORDS, WORDS_PER_SPLAT * n)];

@@ -76,7 +76,7 @@ ${TINT}
     ivec2 unitTexel = ivec2(int(unit % ${ROW_UNITS}u) * ${UNIT_TEXELS}, int(unit / ${ROW_UNITS}u));
     vec4 low = texelFetch(units, unitTexel, 0);
     vec4 grid = texelFetch(units, unitTexel + ivec2(1, 0), 0);
-    vec4 steps = texelFetch(units, unitTexel + ivec2(2, 0), 0); // log scale, coefficients of degree 1 and 2, is used
+    vec4 steps = texelFetch(units, unitTexel + ivec2(2, 0), 0); // log scale, coefficients of degree 1 and 2, 0 unused or 2 antialiased
     if (steps.w == 0.0) return;
     uvec4 words = texelFetch(base, texel, 0);
 
@@ -103,6 +103,13 @@ ${TINT}
     float xx = dot(rowX, rowX) + LOW_PASS_PX2;
     float xy = dot(rowX, rowY);
     float yy = dot(rowY, rowY) + LOW_PASS_PX2;
+
+    if (steps.w == 2.0) {
+      // The low-pass enlarges the splat; the product of opacity and area is kept (Yu et al. 2024, equation 12).
+      vec3 area = cross(rowX, rowY);
+      alpha *= sqrt(dot(area, area) / (xx * yy - xy * xy));
+      if (alpha < MIN_ALPHA) return;
+    }
 
     // The quad lies along the axes of the ellipse. Its corners are in standard deviations.
     reach = 2.0 * log(255.0 * alpha);

@@ -36,6 +36,7 @@ pub(super) fn encode(splats: &SplatArrays, members: &[u32], scale_factor: f64, s
         scale_factor: f32_of(scale_factor),
         sh_degree,
         sh_ranges: ranges.sh,
+        is_antialiased: splats.is_antialiased,
     };
     ChunkData { layout, bytes: words.chain(sh_words).flat_map(u32::to_le_bytes).collect() }
 }

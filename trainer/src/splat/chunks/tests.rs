@@ -25,7 +25,7 @@ fn of_degree_2(splats: SplatArrays) -> SplatArrays {
 
 #[expect(clippy::cast_possible_truncation, reason = "splats are f32")]
 fn decoded(data: &ChunkData) -> SplatArrays {
-    let ChunkLayout::Splats { n_splats, min_m, max_m, log_scale_range, scale_factor, sh_degree, sh_ranges } =
+    let ChunkLayout::Splats { n_splats, min_m, max_m, log_scale_range, scale_factor, sh_degree, sh_ranges, .. } =
         data.layout
     else {
         panic!("splats")

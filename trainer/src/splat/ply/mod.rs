@@ -45,14 +45,13 @@ pub fn write(path: &Path, splats: &SplatArrays) -> Result<(), Error> {
 fn from_bytes(bytes: &[u8]) -> Result<(SplatArrays, Vec<String>), String> {
     let header = Header::parse(bytes)?;
     let mut notes = Vec::new();
-    if header.comments().iter().any(|comment| comment.to_ascii_lowercase().replace(' ', "") == "splatrendermode:mip") {
-        notes.push(crate::splat::ANTIALIASED.to_owned());
-    }
+    let is_mip = |comment: &String| comment.to_ascii_lowercase().replace(' ', "") == "splatrendermode:mip";
+    let is_antialiased = header.comments().iter().any(is_mip);
     if header.n_unread() > 0 {
         notes.push(format!("{} bytes after the last row are not used", header.n_unread()));
     }
     if header.has_element("chunk") {
-        return Ok((packed::splats(&header)?, notes));
+        return Ok((SplatArrays { is_antialiased, ..packed::splats(&header)? }, notes));
     }
     let vertices = header.table("vertex")?;
     let names: Vec<&str> = vertices.names().collect();
@@ -79,6 +78,7 @@ fn from_bytes(bytes: &[u8]) -> Result<(SplatArrays, Vec<String>), String> {
         opacity_logits: rows.clone().map(|row| opacity.f32(row)).collect(),
         sh: rows.clone().flat_map(|row| color.coefficients(row)).collect(),
         sh_degree: color.degree,
+        is_antialiased,
     };
     if let Some(filter) = filter {
         rows.for_each(|row| widen(&mut splats, row, filter.f32(row)));
@@ -198,7 +198,8 @@ fn write_to(file: &mut impl Write, splats: &SplatArrays) -> std::io::Result<()> 
     let rest = (0..3 * (n_coefficients - 1)).map(|ix| format!("f_rest_{ix}"));
     let before = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"].map(str::to_owned);
     let after = ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"].map(str::to_owned);
-    writeln!(file, "ply\nformat binary_little_endian 1.0\nelement vertex {}", splats.n_splats())?;
+    let comment = if splats.is_antialiased { "comment SplatRenderMode: mip\n" } else { "" };
+    writeln!(file, "ply\nformat binary_little_endian 1.0\n{comment}element vertex {}", splats.n_splats())?;
     for name in before.into_iter().chain(rest).chain(after) {
         writeln!(file, "property float {name}")?;
     }

@@ -36,6 +36,7 @@ fn render_matches_a_published_picture() {
         near_m: 0.01,
         linear_m: [0.0; 3],
         angular_rad: [0.0; 3],
+        is_antialiased: false,
     };
     let (means, scales, quats) = (floats("means"), floats("scales"), floats("quats"));
     let (opacities, coeffs, picture) = (floats("opacities"), floats("coeffs"), floats("out_img"));

@@ -24,6 +24,7 @@ pub(crate) fn tilted_view() -> View {
         near_m: 0.05,
         linear_m: [0.0; 3],
         angular_rad: [0.0; 3],
+        is_antialiased: false,
     }
 }
 

@@ -95,9 +95,6 @@ impl Header {
 
     fn notes(&self, n_extension_bytes: u64) -> Vec<String> {
         let mut notes = Vec::new();
-        if self.flags & IS_ANTIALIASED != 0 {
-            notes.push(crate::splat::ANTIALIASED.to_owned());
-        }
         if n_extension_bytes > 0 {
             notes.push(format!("{n_extension_bytes} bytes of extensions are not used"));
         }
@@ -214,6 +211,7 @@ fn splats(header: &Header, body: &[u8]) -> SplatArrays {
         opacity_logits: alphas.iter().map(|byte| quantize::opacity_logit_from_byte(*byte)).collect(),
         sh,
         sh_degree: header.sh_degree,
+        is_antialiased: header.flags & IS_ANTIALIASED != 0,
     }
 }
 
@@ -230,7 +228,8 @@ fn uncompressed_bytes(splats: &SplatArrays) -> Result<Vec<u8>, Error> {
     let fractional_bits = fractional_bits(&splats.means)?;
     let mut bytes = MAGIC.to_vec();
     bytes.extend([MAX_VERSION, n_splats].map(u32::to_le_bytes).as_flattened());
-    bytes.extend([u8::try_from(splats.sh_degree).expect("checked to be at most 3"), fractional_bits, 0, 0]);
+    bytes.extend([u8::try_from(splats.sh_degree).expect("checked to be at most 3"), fractional_bits]);
+    bytes.extend([if splats.is_antialiased { IS_ANTIALIASED } else { 0 }, 0]);
     for mean in &splats.means {
         bytes.extend(flipped(*mean).map(|meters| quantize::fixed_from_mean(meters, fractional_bits)).as_flattened());
     }

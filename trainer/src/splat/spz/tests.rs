@@ -105,6 +105,7 @@ fn one_splat_file_has_the_specified_bytes() {
         opacity_logits: vec![0.0],
         sh: vec![[0.0, 1.0, -9.0], [0.25, 0.5, -0.5], [0.0, 1.0, -1.0], [0.125, 0.0, 0.0]],
         sh_degree: 1,
+        is_antialiased: false,
     };
     #[rustfmt::skip]
     let expected = [

@@ -158,6 +158,7 @@ fn spread_out(arrays: &SplatArrays, n: usize) -> SplatArrays {
         opacity_logits: picks.iter().map(|ix| arrays.opacity_logits[*ix]).collect(),
         sh: picks.iter().flat_map(|ix| arrays.sh[ix * n_coeffs..(ix + 1) * n_coeffs].iter().copied()).collect(),
         sh_degree: arrays.sh_degree,
+        is_antialiased: arrays.is_antialiased,
     }
 }
 
