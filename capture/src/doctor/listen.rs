@@ -279,10 +279,12 @@ mod tests {
         assert!(problem(&slow).is_some_and(|finding| finding.message.contains("expected 15.0 Hz")));
         let lossy = track(301, 100, 4).summarize("camera \"wrist\"".into(), Some(10.0), false);
         assert!(problem(&lossy).is_some_and(|finding| finding.message.contains("dropped 4 images")));
-        for (nanos_per_sample, expected) in [(1e5, "microseconds"), (100.0, "milliseconds"), (3e7, "3.0e-1 s per second")] {
+        for (nanos_per_sample, expected) in
+            [(100_000, "microseconds"), (100, "milliseconds"), (30_000_000, "3.0e-1 s per second")]
+        {
             let mut track = Track::default();
             for ix in 0..21_i64 {
-                track.note(Stamp((ix as f64 * nanos_per_sample) as i64), Stamp(ix * 100_000_000));
+                track.note(Stamp(ix * nanos_per_sample), Stamp(ix * 100_000_000));
             }
             let finding = wrong_unit(&track.summarize("arm".into(), None, false)).expect("not nanoseconds");
             assert!(finding.message.contains(expected), "{}", finding.message);

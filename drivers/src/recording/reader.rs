@@ -230,7 +230,9 @@ impl Names {
             return;
         }
         if self.reported.insert(topic.to_owned()) {
-            log::warn!("the messages of topic {topic:?} have the frame_id {in_message:?}; the name in the topic counts");
+            log::warn!(
+                "the messages of topic {topic:?} have the frame_id {in_message:?}; the name in the topic counts"
+            );
         }
         *in_message = in_topic.into();
     }
