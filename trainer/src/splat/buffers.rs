@@ -65,7 +65,9 @@ impl SplatBuffers {
             sh_degree,
             n_sh_rest: n_sh_rest(sh_degree),
             is_antialiased: 0,
-            unused: [0; 3],
+            unused_0: 0,
+            unused_1: 0,
+            unused_2: 0,
         };
         Ok(Self {
             n_splats: 0,
@@ -139,7 +141,9 @@ impl SplatBuffers {
             sh_degree,
             n_sh_rest,
             is_antialiased: self.is_antialiased.into(),
-            unused: [0; 3],
+            unused_0: 0,
+            unused_1: 0,
+            unused_2: 0,
         };
         gpu.write(&self.model, 0, bytemuck::bytes_of(&sizes));
     }

@@ -123,7 +123,7 @@ fn different_data_and_invalid_states_are_rejected() {
     let message = resume_error(&checkpoint, &keyframes[..5]).to_string();
     assert_eq!(
         message,
-        "the checkpoint belongs to different data: 1 of its images is missing, the first is image 5 of camera \"test\""
+        "the checkpoint belongs to different data: 4 of its images are missing, the first is image 5 of camera \"test\""
     );
     let error_with_changed_keyframe = |change: &dyn Fn(&mut Keyframe)| {
         let mut other = keyframes.clone();

@@ -351,7 +351,11 @@ mod tests {
                 crop_max
             ]
         );
-        assert_layout!(KERNELS, Model, [n_splats, capacity, sh_degree, n_sh_rest, is_antialiased]);
+        assert_layout!(
+            KERNELS,
+            Model,
+            [n_splats, capacity, sh_degree, n_sh_rest, is_antialiased, unused_0, unused_1, unused_2]
+        );
         assert_layout!(
             KERNELS,
             Rule,

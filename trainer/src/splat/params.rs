@@ -11,7 +11,9 @@ pub(crate) struct Model {
     pub(crate) sh_degree: u32,
     pub(crate) n_sh_rest: u32,
     pub(crate) is_antialiased: u32,
-    pub(crate) unused: [u32; 3],
+    pub(crate) unused_0: u32,
+    pub(crate) unused_1: u32,
+    pub(crate) unused_2: u32,
 }
 
 /// `Capacity` of shared/capacity.wgsl.
