@@ -42,7 +42,7 @@ fn main() -> ExitCode {
 fn start_threads() -> anyhow::Result<()> {
     background::start_threads().map_err(|error| {
         anyhow::anyhow!(
-            "cannot start a thread per processor: {error}; raise the limit on threads (ulimit -u, TasksMax)"
+            "cannot start one thread per processor: {error}; raise the limits on threads (ulimit -u, TasksMax) and on memory"
         )
     })
 }

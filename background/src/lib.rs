@@ -1,5 +1,10 @@
-//! Work beside the main thread. A limit on threads or memory can forbid new threads in the middle of a run; the work is then
-//! done on the calling thread, because what was captured and trained must still be saved.
+//! Background tasks. If a limit on threads or memory prevents a new thread during a run, the calling thread does the work, so
+//! that keyframes and models are still saved.
+//!
+//! ```
+//! let task = background::Task::start("sum", || (1..=100).sum::<u32>());
+//! assert_eq!(task.join().expect("no panic"), 5050);
+//! ```
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -54,8 +59,11 @@ impl<T: Send + 'static> Task<T> {
     }
 }
 
-/// Starts the threads that share the work of this program, one per processor, so that a lack of threads is known before
-/// anything is captured.
+/// Starts the global thread pool, one thread per processor, so that a limit on threads is found before data are captured.
+///
+/// # Errors
+///
+/// Fails if a thread cannot be started, or if the pool exists already.
 pub fn start_threads() -> Result<(), Box<dyn std::error::Error + Send + Sync>> {
     Ok(rayon::ThreadPoolBuilder::new().build_global()?)
 }
@@ -77,8 +85,8 @@ fn warn_once(error: &dyn std::error::Error) {
     static HAS_WARNED: AtomicBool = AtomicBool::new(false);
     if !HAS_WARNED.swap(true, Ordering::Relaxed) {
         log::warn!(
-            "cannot start a thread: {error}; the main thread does the work, which is slower; check the limits on threads \
-             (ulimit -u, TasksMax) and on memory"
+            "cannot start a thread: {error}; the calling thread does the work, which slows the run down; raise the limits on \
+             threads (ulimit -u, TasksMax) and on memory"
         );
     }
 }

@@ -46,7 +46,7 @@ impl Kept {
         if self.path.metadata().is_ok_and(is_this) {
             return Place::Here;
         }
-        // Only Linux tells the path of an open file. After a removal, it ends with a note instead of a name.
+        // Only Linux reports the path of an open file. For a removed file, this path ends with " (deleted)" and does not exist.
         let now = std::fs::read_link(self.in_proc());
         let moved = now.ok().filter(|now| now.metadata().is_ok_and(is_this));
         moved.map_or(Place::Removed, Place::MovedTo)

@@ -4,8 +4,8 @@
 //! - Whole files are written under a temporary name and then renamed, so that they are complete or absent. [`begin`] is the
 //!   exception: it starts a growing log under its final name.
 //! - Symbolic links are followed when reading, but neither the temporary nor the final name of an output is followed.
-//! - Files and folders that are in use are [`Kept`]: it is noticed if somebody removes or renames them, and their contents
-//!   are written again.
+//! - A file or folder that stays in use for a whole run can be [`Kept`] open. [`Kept::place`] then reports whether it was
+//!   removed or renamed, and [`Kept::restore`] restores a removed file.
 //! - Of two programs that write the same file at the same time, the second gets an error, if the file system supports
 //!   locks.
 

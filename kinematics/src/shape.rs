@@ -3,7 +3,7 @@
 use crate::Transform;
 use crate::urdf::element::{Element, Notes, Problem};
 use crate::urdf::joint::{ORIGIN_ATTRIBUTES, origin};
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 
 /// A shape that is attached to a link.
 #[derive(Clone, Debug, PartialEq)]
@@ -67,8 +67,12 @@ pub(crate) fn read_all(robot: Element<'_>, notes: &mut Notes) -> HashMap<String,
     let mut by_link = HashMap::<String, LinkShapes>::new();
     // A material that a link defines may be used by all others.
     let mut visuals = Vec::new();
+    let mut seen = HashSet::new();
     for link in robot.all("link") {
         let name = link.attribute("name").unwrap_or_default();
+        if !seen.insert(name) {
+            continue;
+        }
         let of_link = format!("link {name:?}");
         link.note_unknown(&["name", "type"], &["visual", "collision", "inertial"], notes);
         check_inertials(link, &of_link, notes);

@@ -121,7 +121,7 @@ impl Evaluator {
         Ok(Self { is_full: true, lpips: load_lpips(lpips_weights)?.map(Arc::new) })
     }
 
-    /// The same scores except LPIPS, which takes seconds per image.
+    /// Returns this evaluator without LPIPS, which takes seconds per image.
     #[must_use]
     pub fn without_lpips(&self) -> Self {
         Self { lpips: None, ..self.clone() }
@@ -183,7 +183,7 @@ impl Evaluator {
                     let (ix, sender) = (n_drawn, sender.clone());
                     scope.spawn(move |_| {
                         let scores = catch_unwind(AssertUnwindSafe(|| drawn.scores(self)));
-                        // Nobody waits after an error of another keyframe.
+                        // After an error of another keyframe, this result is not used.
                         let _ = sender.send((ix, keyframe, scores));
                     });
                     n_drawn += 1;
@@ -203,7 +203,7 @@ impl Evaluator {
         Ok(scored.into_iter().map(|(_, scores)| scores).collect())
     }
 
-    /// Renders what the scores of a keyframe need.
+    /// Renders the pictures from which the scores of a keyframe are computed.
     fn draw<'a>(&self, method: &mut dyn Method, keyframe: &'a Keyframe) -> crate::Result<Drawn<'a>> {
         let (depth, at_truth) = match self.is_full {
             true => (draw_depth(method, keyframe)?, draw_at_truth(method, keyframe)?),

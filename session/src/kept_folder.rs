@@ -16,9 +16,9 @@ const KEYFRAME_LIST: &str = "keyframes.txt";
 /// A folder that is made again if it disappears.
 #[derive(Debug)]
 pub struct KeptFolder {
-    /// `None` if it cannot be watched, or no longer.
+    /// `None` if the folder cannot be watched, or could not be created again.
     kept: Option<Kept>,
-    /// Files that only the start of a run writes.
+    /// Names and contents of the files that are written only at the start of a run.
     first_files: Vec<(&'static str, Vec<u8>)>,
     next_check: Instant,
 }
@@ -47,7 +47,7 @@ impl KeptFolder {
         }
     }
 
-    /// Makes the folder again if it has disappeared. Whatever is written later is then in the new folder.
+    /// Creates the folder again if it was removed or renamed. Later writes go to the new folder.
     pub fn check(&mut self) {
         let Some(kept) = &self.kept else { return };
         let path = kept.path().to_owned();
@@ -63,7 +63,7 @@ impl KeptFolder {
                 Some(kept)
             }
             Err(error) => {
-                log::warn!("the run folder {shown} {what}, and no new one can be made: {error:#}");
+                log::warn!("the run folder {shown} {what}, and no new one can be created: {error:#}");
                 None
             }
         };

@@ -20,7 +20,7 @@ pub(crate) struct PendingEvaluation {
 
 impl PendingEvaluation {
     /// An evaluation due at `seconds` that scores at most `max_images` of the test keyframes, and fewer if `max_spent` is
-    /// over before: on a CPU, rendering a neural field takes seconds per image.
+    /// reached first: on a CPU, rendering a neural field takes seconds per image.
     pub(crate) fn new<'a>(
         seconds: f64,
         tests: impl ExactSizeIterator<Item = &'a Arc<Keyframe>>,

@@ -130,7 +130,7 @@ impl Session {
         self
     }
 
-    /// Makes these folders of the run again if somebody removes or renames them.
+    /// Sets the folders of the run that are created again if they are removed or renamed.
     #[must_use]
     pub fn with_folders(mut self, folders: Vec<KeptFolder>) -> Self {
         self.persistence.set_folders(folders);

@@ -491,7 +491,7 @@ fn save(
     } else {
         SampleUse::ProcessedOnly
     });
-    // An incomplete recording cannot be used to score the model later.
+    // Commands that score the model later need a complete recording at this path.
     let is_moved = args.record.as_ref().is_some_and(|file| !file.exists());
     let is_recorded = input_result.recording_error.is_none() && !is_moved;
     data_losses.extend(input_result.recording_error.map(|error| format!("the recording is incomplete: {error:#}")));
@@ -587,8 +587,8 @@ impl PreviousRun {
         let (resumed, missing) = trainer::resume_without_missing(gpu.clone(), &self.checkpoint, &self.keyframes)?;
         if let Some((camera, stamp)) = missing.first() {
             log::warn!(
-                "{} of that run {} missing, the first of camera {camera:?} at {} ns: the model keeps what it has learned \
-                 from them, but is no longer trained on them",
+                "{} of the earlier run {} missing, the first of camera {camera:?} at {} ns: training continues without them, \
+                 but their effect on the model so far remains",
                 counted(missing.len() as u64, "keyframe"),
                 if missing.len() == 1 { "is" } else { "are" },
                 stamp.0

@@ -128,13 +128,15 @@ fn several_methods_share_time_and_one_clock() {
     };
     let number = |event: &Value, key: &str| event[key].as_f64().unwrap_or_else(|| panic!("no {key} in {event}"));
     let (splat, nerf) = (evals("splat"), evals("nerf"));
-    assert!(splat.len() >= 3 && splat.len() == nerf.len(), "{printed:?}");
-    for (one, other) in splat.iter().zip(&nerf) {
-        assert!(
-            (number(one, "seconds") - number(other, "seconds")).abs() < 0.02,
-            "at the same evaluation point: {one}, {other}"
-        );
-    }
+    // Evaluations of a slow method are left out if they take too long.
+    assert!(splat.len() >= 3 && (1..=splat.len()).contains(&nerf.len()), "{printed:?}");
+    let at_the_same_time = |of_nerf: &&Value| -> &Value {
+        let gap = |of_splat: &&&Value| (number(of_splat, "seconds") - number(of_nerf, "seconds")).abs();
+        let nearest = splat.iter().min_by(|one, other| gap(one).total_cmp(&gap(other))).expect("three");
+        assert!(gap(&nearest) < 0.02, "at the same evaluation point: {nearest}, {of_nerf}");
+        nearest
+    };
+    let splat: Vec<&Value> = nerf.iter().map(at_the_same_time).collect();
     let millis = |evals: &[&Value]| {
         let last = evals.last().expect("evaluations");
         number(last, "step") * number(last, "step_millis")

@@ -162,14 +162,24 @@ impl<M: Recalibrate + 'static> Aligned<M> {
                 folder.display()
             );
         }
-        let alignment_task = AlignmentTask::done(read_metadata(folder)?.alignment);
+        let metadata = read_metadata(folder)?;
+        let unknown = metadata.unknown();
+        if !unknown.is_empty() {
+            log::warn!(
+                "{METADATA_FILE} of {} has unknown fields, which are ignored: {}",
+                folder.display(),
+                unknown.join(", ")
+            );
+        }
+        let alignment_task = AlignmentTask::done(metadata.alignment);
         Ok(Self { alignment_task, ..Self::new(model, CameraRefinement::default(), false, 0) })
     }
 
     /// Resumes from a checkpoint. `resume` receives the corrected keyframes, and returns the model and the keyframes
     /// that it was not trained on.
     ///
-    /// * `placeholders`: stand for missing keyframes, with their corrected poses. They must be removed afterwards.
+    /// * `placeholders`: keyframes without pixels, with corrected poses, in place of missing keyframes. The caller must
+    ///   remove them from the resumed model.
     pub fn resume(
         checkpoint: &Checkpoint,
         keyframes: &[Arc<Keyframe>],

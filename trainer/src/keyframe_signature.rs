@@ -48,7 +48,7 @@ impl KeyframeSignature {
     /// A keyframe without pixels that stands for the recorded one.
     fn placeholder(&self) -> Keyframe {
         let [x, y, z, i, j, k, w] = self.world_from_camera;
-        // Bit by bit, so that it matches this signature.
+        // Not normalized again, so that the pose is bit-identical to that of this signature.
         let rotation = UnitQuaternion::new_unchecked(Quaternion::new(w, i, j, k));
         let world_from_camera = Transform::from_parts(Translation3::new(x, y, z), rotation);
         let depth = self.depth_size_px.map(|size_px| DepthMap {
@@ -103,7 +103,8 @@ impl KeyframeSignature {
 /// The matched keyframes in the expected order, and all other keyframes.
 pub(crate) type MatchedAndOthers = (Vec<Arc<Keyframe>>, Vec<Arc<Keyframe>>);
 
-/// Finds the expected keyframes. Fails if some are missing, with placeholders for them, or if one differs.
+/// Finds the expected keyframes. Fails if one differs, or if some are missing; the error then contains placeholders for the
+/// missing ones.
 pub(crate) fn match_keyframes(
     expected: &[KeyframeSignature],
     keyframes: &[Arc<Keyframe>],

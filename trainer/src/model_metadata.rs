@@ -8,7 +8,7 @@ use std::path::Path;
 /// File that describes a saved model, in the model's folder.
 pub(crate) const METADATA_FILE: &str = "model.json";
 
-/// Fields that only inform people and other programs.
+/// Fields that are written for users and other programs, but not read.
 const INFORMATION: [&str; 11] = [
     "steps",
     "seed",
@@ -43,24 +43,23 @@ pub(crate) struct ModelMetadata {
 }
 
 impl ModelMetadata {
-    /// Differences between the file and the splats of the model, as sentences without a period. The splats count.
+    /// Differences between the file and the splats of the model, as sentences without a period. The values of the splats are used.
     pub(crate) fn differences(&self, n_splats: u64, sh_degree: u32) -> Vec<String> {
         let differs = |what, stated: Option<u64>, actual: u64| {
             let stated = stated.filter(|stated| *stated != actual)?;
-            Some(format!("{METADATA_FILE} says {what} {stated}, the file of splats has {actual}, which is used"))
+            Some(format!("{what} is {stated} in {METADATA_FILE}, but {actual} in the file of splats, which is used"))
         };
         let of_splats = differs("splats", self.splats, n_splats);
         of_splats.into_iter().chain(differs("sh_degree", self.sh_degree, sh_degree.into())).collect()
     }
 
-    /// Names of fields that no version of this program writes.
-    fn unknown(&self) -> Vec<&str> {
+    /// Names of fields that this version neither writes nor reads.
+    pub(crate) fn unknown(&self) -> Vec<&str> {
         self.others.keys().map(String::as_str).filter(|key| !INFORMATION.contains(key)).collect()
     }
 }
 
-/// Reads the file in the folder of a saved model; everything is empty if it does not exist. Unknown fields are named in a
-/// warning.
+/// Reads the file in the folder of a saved model; everything is empty if it does not exist.
 ///
 /// # Errors
 ///
@@ -72,12 +71,7 @@ pub(crate) fn read_metadata(folder: &Path) -> Result<ModelMetadata, Error> {
         Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(ModelMetadata::default()),
         read => read.map_err(|error| invalid_file(error.to_string()))?,
     };
-    let metadata = parse(&bytes).map_err(invalid_file)?;
-    let unknown = metadata.unknown();
-    if !unknown.is_empty() {
-        log::warn!("{} has unknown fields, which are ignored: {}", path.display(), unknown.join(", "));
-    }
-    Ok(metadata)
+    parse(&bytes).map_err(invalid_file)
 }
 
 fn parse(bytes: &[u8]) -> Result<ModelMetadata, String> {
@@ -129,7 +123,10 @@ mod tests {
         assert!(error.contains("rotation_deg"), "{error}");
         let metadata = parsed("splats", json!(7)).expect("valid");
         assert_eq!(metadata.differences(7, 3), [""; 0]);
-        assert_eq!(metadata.differences(8, 3), ["model.json says splats 7, the file of splats has 8, which is used"]);
+        assert_eq!(
+            metadata.differences(8, 3),
+            ["splats is 7 in model.json, but 8 in the file of splats, which is used"]
+        );
         assert_eq!(parsed("sh_degree", json!(2)).expect("valid").differences(8, 3).len(), 1);
     }
 }

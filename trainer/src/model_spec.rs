@@ -107,8 +107,8 @@ pub fn resume(gpu: Arc<Gpu>, checkpoint: &Checkpoint, keyframes: &[Arc<Keyframe>
     resume_with(gpu, checkpoint, keyframes, &[])
 }
 
-/// Like [`resume`], but keyframes may be missing. They are removed from the model, which keeps what it has learned from
-/// them. Also returns their cameras and stamps.
+/// Like [`resume`], but keyframes may be missing. They are removed from the training set; their effect on the
+/// parameters remains. Also returns the cameras and stamps of the missing keyframes.
 ///
 /// # Errors
 ///

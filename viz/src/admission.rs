@@ -108,7 +108,7 @@ struct ConnectionState {
 
 #[derive(Debug)]
 struct Client {
-    /// Operators are replaced only if they are dispensable; viewers make room for operators.
+    /// Operators are replaced only if they are inactive. Active viewers are replaced if an operator needs the place.
     is_operator: bool,
     admitted: Instant,
     /// Time of the last message. Pongs do not count, because libraries send them automatically.
@@ -159,8 +159,8 @@ impl Admission {
         oldest.inspect(|(.., connection)| connection.close("replaced by a new connection")).is_some()
     }
 
-    /// Registers a WebSocket client on its connection. At the limit, it replaces the most dispensable client. If all are in
-    /// use, an operator replaces the viewer that came last, so that viewers cannot lock operators out.
+    /// Registers a WebSocket client on its connection. At the limit, it replaces the most dispensable client. If all are
+    /// active, an operator replaces the viewer that connected last, so that viewers cannot lock operators out.
     pub(crate) fn admit_client(&self, connection: &Connection, is_operator: bool) -> bool {
         // Held until the client is registered, so that two clients cannot take the same free slot.
         let registry = self.registry();

@@ -1,4 +1,4 @@
-//! A log of what clients do, which no client can use to fill a disk.
+//! A log of client activity with a limited rate, so that clients cannot fill the disk.
 
 use parking_lot::Mutex;
 use std::fmt::Arguments;
@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 const MAX_LINES: u32 = 100;
 const PERIOD: Duration = Duration::from_secs(10);
 
-/// See the module.
+/// Logs client activity, at most [`MAX_LINES`] lines per [`PERIOD`].
 #[derive(Debug)]
 pub(crate) struct ClientLog {
     budget: Mutex<Budget>,
@@ -25,7 +25,7 @@ impl ClientLog {
         Self { budget: Mutex::new(Budget { since: Instant::now(), n_lines: 0 }) }
     }
 
-    /// Logs a line, unless there were too many. The next line after a period tells how many were left out.
+    /// Logs a line, unless there were too many. The first line of the next period is preceded by the number of omitted lines.
     pub(crate) fn line(&self, text: Arguments<'_>) {
         let (n_omitted, is_logged) = self.budget.lock().count(Instant::now());
         if n_omitted > 0 {

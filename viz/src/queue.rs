@@ -14,10 +14,10 @@ use trainer::Rendered;
 
 /// Maximum number of pictures per client that are being rendered or sent. It limits rendering for slow clients.
 const MAX_UNSENT: usize = 2;
-/// Memory that each client may use for these pictures, bytes. Every picture fits whose depth is not requested as f32.
+/// Memory that each client may use for these pictures, bytes. Any picture without f32 depth fits.
 const CLIENT_BYTES: usize = 16 << 20;
-/// Memory for larger pictures, which the clients of a role share. Operators have a share of their own, so that viewers that
-/// read slowly do not delay them.
+/// Additional memory for larger pictures, bytes, shared by all clients of a role. Viewers and operators have separate
+/// shares, so that slow viewers do not delay operators.
 const SHARED_BYTES: usize = 256 << 20;
 
 /// Maximum number of results that wait to be sent to a client. A client that does not read misses the reasons of further
@@ -217,7 +217,8 @@ impl ClientQueue {
         self.unsent.iter().sum()
     }
 
-    /// The next view in turn whose picture fits into the client's own memory, or as its only picture into this much more.
+    /// The next view in turn whose picture fits into [`CLIENT_BYTES`]. If the client has no other picture, `n_shared_bytes` are
+    /// added.
     fn next_view(&self, n_shared_bytes: usize) -> Option<Arc<str>> {
         if self.unsent.len() >= MAX_UNSENT {
             return None;

@@ -16,7 +16,7 @@ pub(crate) struct ServerContext {
     pub(crate) clock: ServerClock,
     /// The latest encoded messages.
     pub(crate) latest_messages: watch::Receiver<LatestMessages>,
-    /// What clients do.
+    /// Log of client activity.
     pub(crate) log: Arc<ClientLog>,
     /// Becomes true when the server stops.
     pub(crate) stopped: watch::Receiver<bool>,

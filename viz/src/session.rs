@@ -128,7 +128,10 @@ impl Reader<'_> {
                 Ok(Ok(())) if is_last => return self.discard().await,
                 Ok(Ok(())) => {}
                 Err(_) => {
-                    self.log.line(format_args!("client {}: it left {MAX_REPLIES} replies unread", self.client));
+                    self.log.line(format_args!(
+                        "client {}: disconnecting, because it left {MAX_REPLIES} replies unread for {MAX_REPLY_WAIT:?}",
+                        self.client
+                    ));
                     return;
                 }
                 Ok(Err(_)) => return self.discard().await,

@@ -63,14 +63,14 @@ pub enum ConfigError {
     #[error(
         "{first}{}{}",
         .others.iter().map(|other| format!("\n  also: {other}")).collect::<String>(),
-        if *.n_more > 0 { format!("\n  and {n_more} more") } else { String::new() }
+        if *.n_more > 0 { format!("\n  and {n_more} more problems") } else { String::new() }
     )]
     Several {
         /// The problem that is most likely the cause of others.
         first: Box<Self>,
-        /// The other problems, a limited number.
+        /// The other listed problems.
         others: Vec<Self>,
-        /// Number of problems besides these.
+        /// Number of further problems, which are not listed.
         n_more: usize,
     },
     /// The robot description does not match the rig file.

@@ -10,11 +10,11 @@ use std::collections::{BTreeMap, BTreeSet};
 use toml::de::{DeTable, DeValue};
 use toml::{Table, Value};
 
-/// Problems that are kept; more are only counted.
+/// Maximum number of listed problems; further ones are only counted.
 const MAX_PROBLEMS: usize = 50;
 
-/// Maximum number of tables with free names: cameras, scanners, motors or tags. More are a mistake of a program that wrote
-/// the file.
+/// Maximum number of tables with free names: cameras, scanners, motors or tags. More are probably an error of the program
+/// that wrote the file.
 const MAX_TABLES: usize = 1000;
 
 /// State shared by all sections while a rig file is read.

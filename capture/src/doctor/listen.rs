@@ -14,7 +14,7 @@ use std::time::{Duration, Instant};
 /// A device is reported if its rate is below this fraction of the rate in the rig file.
 const MIN_RATE_FRAC: f64 = 0.95;
 
-/// Shorter spans are too uncertain to compare stamps with time.
+/// Minimum time between the first and the last sample for comparing the stamps with the clock of this computer.
 const MIN_RECEIVED_SECS: f64 = 0.5;
 
 /// Measurements of one device, or of the keyframes made from its images.
@@ -35,7 +35,8 @@ pub struct DeviceStatistics {
     pub latency: Option<Latency>,
     /// 99th percentile of the intervals between samples.
     pub gap_p99_millis: f64,
-    /// Time by which the stamps advance per second; `None` for simulated devices, and with few samples.
+    /// Seconds by which the stamps advance per second of this computer, normally 1. `None` for simulated devices, and if the
+    /// samples arrived within less than [`MIN_RECEIVED_SECS`].
     pub stamp_secs_per_sec: Option<f64>,
 }
 
@@ -233,7 +234,7 @@ fn wrong_unit(statistics: &DeviceStatistics) -> Option<Finding> {
     let unit = units.into_iter().find(|(_, of_unit)| (0.5..2.0).contains(&(rate / of_unit)));
     let guess = unit.map_or(String::new(), |(unit, _)| format!(", as if they were in {unit}"));
     let message = format!("{}: its stamps advance by {rate:.1e} s per second{guess}", statistics.device);
-    Some(Finding::fail("stamps", message, "send stamps in nanoseconds, of one clock"))
+    Some(Finding::fail("stamps", message, "send stamps in nanoseconds from a single clock"))
 }
 
 impl std::fmt::Display for DeviceStatistics {

@@ -72,7 +72,7 @@ pub(super) fn ideal_joints() -> JointSimulator {
 #[test]
 fn ten_thousand_states_are_received_in_both_versions() {
     // Loopback loses nothing, but a busy machine fails to send or receive some states in time. After a stall, the emulated
-    // controller sends what it missed at once, and as many again can overflow the receive buffer.
+    // controller sends all delayed states at once; the receive buffer can overflow, which loses up to as many states again.
     const MIN_FRAC: f64 = 0.99;
     const LOST_PER_STALL: f64 = 2.0;
     // Maximum delay of a stamp, from the wake-up latency of one thread.

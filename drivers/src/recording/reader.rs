@@ -224,14 +224,14 @@ struct Names {
 }
 
 impl Names {
-    /// Replaces the name in a message by that in its topic, which counts, and reports the first difference of each topic.
+    /// Replaces the name in a message with the name in its topic. Logs the first difference of each topic.
     fn agree(&mut self, topic: &str, in_topic: &str, in_message: &mut Arc<str>) {
         if **in_message == *in_topic {
             return;
         }
         if self.reported.insert(topic.to_owned()) {
             log::warn!(
-                "the messages of topic {topic:?} have the frame_id {in_message:?}; the name in the topic counts"
+                "topic {topic:?}: its messages have the frame_id {in_message:?}, expected {in_topic:?}; the name in the topic is used"
             );
         }
         *in_message = in_topic.into();

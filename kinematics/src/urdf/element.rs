@@ -2,7 +2,8 @@
 
 use crate::Error;
 use roxmltree::{Document, Node, ParsingOptions};
-use std::collections::BTreeMap;
+use std::borrow::Cow;
+use std::collections::{BTreeMap, BTreeSet};
 
 /// Maximum size of a robot description.
 pub const MAX_BYTES: usize = 16 << 20;
@@ -11,6 +12,51 @@ const MAX_NODES: u32 = 1 << 20;
 const MAX_ATTRIBUTES: usize = 2000;
 const MAX_NAMESPACES: usize = 100;
 const MAX_NOTES: usize = 100;
+
+/// Repairs what the parsers of other programs accept: white space before the XML declaration, and prefixes without a
+/// namespace. Lines stay as they are.
+pub(super) fn repaired(xml: &str) -> Cow<'_, str> {
+    let mut text = Cow::Borrowed(xml);
+    let begin = xml.len() - xml.trim_start().len();
+    if begin > 0
+        && xml[begin..].starts_with("<?xml")
+        && let Some(n) = xml[begin..].find("?>")
+    {
+        text.to_mut().replace_range(begin..begin + n + 2, "");
+    }
+    let unbound: String = prefixes(xml)
+        .into_iter()
+        .filter(|prefix| !["xml", "xmlns", "xacro"].contains(prefix) && !xml.contains(&format!("xmlns:{prefix}")))
+        .map(|prefix| format!(" xmlns:{prefix}=\"{prefix}\""))
+        .collect();
+    if !unbound.is_empty()
+        && let Some(at) = text.find("<robot")
+    {
+        text.to_mut().insert_str(at + "<robot".len(), &unbound);
+    }
+    text
+}
+
+/// The prefixes of elements and attributes, a limited number; values of attributes may add others.
+fn prefixes(xml: &str) -> BTreeSet<&str> {
+    let is_plain = |prefix: &&str| {
+        prefix.starts_with(|first: char| first.is_ascii_alphabetic() || first == '_')
+            && prefix.chars().all(|c| c.is_ascii_alphanumeric() || c == '_' || c == '-')
+    };
+    let mut found = BTreeSet::new();
+    for tag in xml.split('<').skip(1) {
+        let tag = tag.split('>').next().unwrap_or_default();
+        let names = tag.split_whitespace().enumerate().filter_map(|(ix, word)| match ix {
+            0 => Some(word.trim_start_matches('/')),
+            _ => word.split_once('=').map(|(name, _)| name),
+        });
+        found.extend(names.filter_map(|name| Some(name.split_once(':')?.0)).filter(is_plain));
+        if found.len() > MAX_NAMESPACES {
+            break;
+        }
+    }
+    found
+}
 
 /// Parses XML whose size and structure are limited.
 pub(super) fn parse(xml: &str) -> Result<Document<'_>, Error> {

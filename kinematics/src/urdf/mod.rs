@@ -34,10 +34,11 @@ impl Robot {
     /// [`Robot::notes`].
     ///
     /// # Errors
-    /// If it is not the XML of a robot, is larger than [`MAX_BYTES`], a link or joint has no name, a joint lacks a link, a
-    /// link has two parents, or joints form a cycle.
+    /// If it is not the XML of a robot, is larger than [`MAX_BYTES`], a link or joint has no name, a joint lacks a link, two
+    /// joints have one name, a link has two parents, or joints form a cycle.
     pub fn parse(xml: &str) -> Result<Self, Error> {
-        let document = element::parse(xml)?;
+        let xml = element::repaired(xml);
+        let document = element::parse(&xml)?;
         let root = Element::root(&document);
         let mut notes = Notes::default();
         root.note_unknown(
@@ -51,12 +52,32 @@ impl Robot {
         let name_of = |link: Element<'_>| -> Result<String, Error> {
             Ok(link.required("name").map_err(|problem| invalid("a link".to_owned(), problem))?.to_owned())
         };
-        let links = root.all("link").map(name_of).collect::<Result<Vec<_>, _>>()?;
+        // Finding a line takes time, so it is done only for notes.
+        let (mut links, mut element_of) = (Vec::new(), HashMap::new());
+        for element in root.all("link") {
+            let link = name_of(element)?;
+            if let Some(first) = element_of.get(&link).map(|first: &Element<'_>| first.line()) {
+                notes.add(
+                    element.line(),
+                    &format!("link {link:?} is defined again; its definition in line {first} is used"),
+                );
+                continue;
+            }
+            element_of.insert(link.clone(), element);
+            links.push(link);
+        }
         if links.is_empty() {
             return Err(Error::NoLinks { robot: name });
         }
-        let joints = root.all("joint").map(|joint| joint::read(joint, &mut notes)).collect::<Result<Vec<_>, _>>()?;
-        indices_by_name("link", root.all("link"))?;
+        let mut joints =
+            root.all("joint").map(|joint| joint::read(joint, &mut notes)).collect::<Result<Vec<_>, _>>()?;
+        for (joint, element) in joints.iter_mut().zip(root.all("joint")) {
+            if let Some(link) = [&joint.parent, &joint.child].into_iter().find(|link| !element_of.contains_key(*link)) {
+                let undefined = Error::UndefinedLink { joint: joint.name.clone(), link: link.clone() };
+                notes.add(element.line(), &format!("joint {:?}: link {link:?} is not defined", joint.name));
+                joint.problem.get_or_insert(undefined);
+            }
+        }
         let joints_by_name = indices_by_name("joint", root.all("joint"))?;
         let joint_above = joints_above(&links, &joints)?;
         reject_cycles(&links, &joints, &joint_above)?;
@@ -153,11 +174,12 @@ fn indices_by_name<'a>(
     Ok(indices)
 }
 
+/// The joint above each link. Joints with an undefined link are left out.
 fn joints_above(links: &[String], joints: &[Joint]) -> Result<HashMap<String, Option<usize>>, Error> {
     let mut above: HashMap<String, Option<usize>> = links.iter().map(|link| (link.clone(), None)).collect();
     for (joint_ix, joint) in joints.iter().enumerate() {
-        if let Some(link) = [&joint.parent, &joint.child].into_iter().find(|link| !above.contains_key(*link)) {
-            return Err(Error::UndefinedLink { joint: joint.name.clone(), link: link.clone() });
+        if !above.contains_key(&joint.parent) || !above.contains_key(&joint.child) {
+            continue;
         }
         if let Some(first_ix) = above.insert(joint.child.clone(), Some(joint_ix)).flatten() {
             return Err(Error::TwoParents {
@@ -247,15 +269,41 @@ mod tests {
             error_message(robot(&(twice.clone() + &twice))),
             r#"urdf: joint "j" is defined twice, in lines 1 and 1"#
         );
-        assert_eq!(error_message(robot(r#"<link name="a"/>"#)), r#"urdf: link "a" is defined twice, in lines 1 and 1"#);
         let two = twice.clone() + &joint_xml("k", "fixed", "c", "b", "");
         assert_eq!(error_message(robot(&two)), r#"urdf: link "b" has two parents, through joints "j" and "k""#);
         let cycle = joint_xml("j", "fixed", "b", "c", "") + &joint_xml("k", "fixed", "c", "b", "");
         assert!(matches!(robot(&cycle), Err(Error::Cycle { .. })));
         let self_loop = joint_xml("j", "fixed", "c", "c", "");
         assert_eq!(error_message(robot(&self_loop)), r#"urdf: link "c" is its own ancestor (the joints form a cycle)"#);
-        let nowhere = joint_xml("j", "fixed", "a", "d", "");
-        assert_eq!(error_message(robot(&nowhere)), r#"urdf: joint "j" joins link "d", which is not defined"#);
+    }
+
+    #[test]
+    fn links_that_are_undefined_or_defined_twice_cost_only_their_joints() {
+        let body = joint_xml("j", "fixed", "a", "d", "") + &joint_xml("w", "fixed", "world", "a", "");
+        let undefined =
+            robot(&(body + &joint_xml("k", "fixed", "a", "b", "") + &joint_xml("l", "fixed", "b", "c", ""))).unwrap();
+        assert_eq!(undefined.root().unwrap(), "a");
+        assert_eq!(undefined.path("a", "c").unwrap().len(), 2);
+        let notes =
+            [r#"line 1: joint "j": link "d" is not defined"#, r#"line 1: joint "w": link "world" is not defined"#];
+        assert_eq!(undefined.notes(), notes);
+        assert!(undefined.path("a", "d").is_err() && undefined.joint("j").unwrap().problem.is_some());
+        let twice =
+            robot("\n<link name=\"a\"><visual><geometry><sphere radius=\"1\"/></geometry></visual></link>").unwrap();
+        assert_eq!(twice.notes(), [r#"line 2: link "a" is defined again; its definition in line 1 is used"#]);
+        assert!(twice.links() == ["a", "b", "c"] && twice.visuals("a").is_empty());
+    }
+
+    #[test]
+    fn files_that_strict_parsers_refuse_are_read() {
+        let late = "\n <?xml version=\"1.0\"?>\n<robot name=\"r\"><link name=\"a\"/><link/></robot>";
+        assert!(error_message(Robot::parse(late)).contains("line 3"), "lines are counted as in the file");
+        let unbound = r#"<robot name="r"><link name="a"/><gazebo><sensor:camera x:y="1"/></gazebo></robot>"#;
+        assert_eq!(Robot::parse(unbound).unwrap().links(), ["a"]);
+        let unexpanded = error_message(Robot::parse(r#"<robot name="r"><xacro:include filename="a"/></robot>"#));
+        assert!(unexpanded.ends_with("expand the file with xacro first"), "{unexpanded}");
+        let many: String = (0..3000).map(|n| format!("<p{n}:a/>")).collect();
+        assert!(Robot::parse(&format!("<robot>{many}</robot>")).is_err());
     }
 
     #[test]

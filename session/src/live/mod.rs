@@ -19,6 +19,8 @@ use std::time::{Duration, Instant};
 use trainer::AlignTiming;
 use viz::Hub;
 
+/// Time without any keyframe until it is reported.
+const WARN_AFTER: Duration = Duration::from_secs(10);
 /// Maximum wait for a keyframe when there is nothing to do.
 const IDLE: Duration = Duration::from_millis(10);
 
@@ -63,6 +65,9 @@ pub struct Live {
     keyframe_change: Option<KeyframeChange>,
     requests: Requests,
     publishing: Publishing,
+    started: Instant,
+    /// When to report that there is still no keyframe.
+    warn_after: Duration,
 }
 
 /// Changes a keyframe before the models receive it.
@@ -87,7 +92,23 @@ impl Live {
             ledger: Ledger::default(),
             keyframe_change: None,
             requests: Requests::default(),
+            started: Instant::now(),
+            warn_after: WARN_AFTER,
         }
+    }
+
+    /// Reports, at growing intervals, that the run has no keyframe yet, and why.
+    fn warn_without_keyframes(&mut self) {
+        if !self.keyframes.is_empty() || self.feed.ended() || self.started.elapsed() < self.warn_after {
+            return;
+        }
+        let rejected: Vec<String> = self.feed.rejected().iter().map(|(why, n)| format!("{n} {why}")).collect();
+        let reason = match rejected.is_empty() {
+            true => "no image has been joined with a pose".to_owned(),
+            false => format!("images rejected: {}", rejected.join(", ")),
+        };
+        log::warn!("no keyframe after {} s, so nothing is trained: {reason}", self.warn_after.as_secs());
+        self.warn_after *= 2;
     }
 
     /// Continues with the keyframes of an earlier run, which the sessions already hold.
@@ -150,6 +171,7 @@ impl Live {
 
     /// Runs one cycle: takes keyframes, trains, draws and publishes. Reopens the GPU if it fails.
     pub fn advance(&mut self) -> crate::Result<()> {
+        self.warn_without_keyframes();
         self.apply_controls();
         self.record_shown_pictures();
         self.apply_edits();

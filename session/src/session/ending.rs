@@ -234,9 +234,13 @@ impl Session {
                 }
             }
             if let Some(pending) = hub.and_then(Hub::next_request) {
-                match pending.method() {
-                    Some(other) if other != kind.name() => pending.fail(&format!("{} is being scored", kind.name())),
-                    _ => viewer::answer(pending, method, edits),
+                let other = pending.method().filter(|name| *name != kind.name()).map(str::to_owned);
+                match other {
+                    Some(other) => {
+                        pending
+                            .fail(&format!("cannot render {other} while {} is scored; try again later", kind.name()));
+                    }
+                    None => viewer::answer(pending, method, edits),
                 }
             }
         };

@@ -22,8 +22,8 @@ pub struct Evaluators {
     pub during_training: Evaluator,
     /// Maximum number of test keyframes in a scheduled evaluation, evenly spread. The final evaluation scores all.
     pub max_images_during_training: usize,
-    /// Maximum time of all scheduled evaluations, as a fraction of the training time. If they take longer, they score fewer
-    /// images, and some are left out. `None`: no limit.
+    /// Maximum time of all scheduled evaluations, as a fraction of the training time. To stay near it, they score fewer
+    /// images, or are skipped. `None`: no limit.
     pub max_frac_during_training: Option<f64>,
     /// Evaluator for the end of training.
     pub at_end: Evaluator,

@@ -112,6 +112,13 @@ impl Browser {
 
     /// Calls a method of the debugging protocol.
     pub fn call(&mut self, method: &str, params: Value) -> Value {
+        let answer = self.answer(method, params);
+        assert!(answer.get("error").is_none(), "{method}: {answer}");
+        answer["result"].clone()
+    }
+
+    /// The answer to a call, which may be an error.
+    fn answer(&mut self, method: &str, params: Value) -> Value {
         self.n_calls += 1;
         let mut message = json!({"id": self.n_calls, "method": method, "params": params});
         if !self.session.is_empty() {
@@ -122,8 +129,7 @@ impl Browser {
             let Message::Text(text) = self.socket.read().expect("chromium answers") else { continue };
             let answer: Value = serde_json::from_str(&text).expect("JSON");
             if answer["id"] == json!(self.n_calls) {
-                assert!(answer.get("error").is_none(), "{method}: {answer}");
-                return answer["result"].clone();
+                return answer;
             }
         }
     }
@@ -133,6 +139,11 @@ impl Browser {
         let result = self.call("Runtime.evaluate", json!({"expression": expression, "returnByValue": true}));
         assert!(result.get("exceptionDetails").is_none(), "{expression}: {result}");
         result["result"]["value"].clone()
+    }
+
+    /// Evaluates an expression that makes the browser load a page, which may end the evaluation with an error.
+    pub fn load_by(&mut self, expression: &str) {
+        self.answer("Runtime.evaluate", json!({"expression": expression}));
     }
 
     /// Waits until all events so far are on screen.

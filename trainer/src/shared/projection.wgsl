@@ -16,7 +16,7 @@ struct Projection {
     mean_px: vec2f,
     covariance: vec3f,        // xx, xy, yy with the low-pass, pixels squared
     determinant: f32,
-    narrowness: f32,          // area of the ellipse without the low-pass, as a fraction of that with it
+    compensation: f32,        // opacity factor: area of the ellipse without the low-pass filter / area with it
     jacobian_x: vec3f,        // rows of the pinhole Jacobian
     jacobian_y: vec3f,
     unclamped: vec2f,         // 1 where x/z, y/z is inside the clamp
@@ -75,7 +75,7 @@ fn project_splat(view: View, mean: vec3f, rotation_wxyz: vec4f, log_scale: vec3f
     // Avoids cancellation: without the low-pass, the determinant is a squared cross product.
     let area = cross(row_x, row_y);
     out.determinant = dot(area, area) + low_pass_px2 * (out.covariance.x + out.covariance.z - low_pass_px2);
-    out.narrowness = sqrt(dot(area, area) / out.determinant);
+    out.compensation = sqrt(dot(area, area) / out.determinant);
     return out;
 }
 

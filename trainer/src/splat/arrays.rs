@@ -25,8 +25,8 @@ pub struct SplatArrays {
     pub sh: Vec<[f32; 3]>,
     /// Degree of the spherical harmonics, 0 to 3.
     pub sh_degree: u32,
-    /// Whether opacities are lowered where the low-pass enlarges splats, as in Mip-Splatting (Yu et al. 2024, equation 12),
-    /// with which other programs can train. Splats that are trained here are not.
+    /// Whether opacities are corrected for the low-pass filter (Mip-Splatting, Yu et al. 2024, equation 12). True only for
+    /// files of other programs that were trained this way; false for splats trained by fieldrig.
     pub is_antialiased: bool,
 }
 

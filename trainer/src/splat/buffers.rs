@@ -148,8 +148,8 @@ impl SplatBuffers {
         gpu.write(&self.model, 0, bytemuck::bytes_of(&sizes));
     }
 
-    /// Appends splats, all of which are then drawn as the last ones say; the caller must reserve capacity. Drops coefficients above this model's degree, and sets missing
-    /// coefficients to zero.
+    /// Appends splats; the caller must reserve capacity. Drops coefficients above this model's degree, and sets missing
+    /// coefficients to zero. `is_antialiased` of `arrays` then applies to all splats of the model.
     pub(crate) fn append(&mut self, gpu: &Gpu, arrays: &SplatArrays) {
         let first = u64::from(self.n_splats);
         let n_new = arrays.means.len();

@@ -54,7 +54,7 @@ fn project(splat_ix: u32) -> u32 {
     let drop_frac = bitcast<f32>(atomicLoad(&status[DROP_FRAC]));
     var opacity = sigmoid(shape.w) / (1.0 - drop_frac);
     // The low-pass enlarges the splat; a model with this flag keeps the product of opacity and area.
-    if model.is_antialiased != 0u { opacity *= projection.narrowness; }
+    if model.is_antialiased != 0u { opacity *= projection.compensation; }
     // These comparisons are false for NaN, so a splat with a NaN is invisible.
     let visible = projection.visible && opacity > MIN_ALPHA && projection.determinant > 0.0 && inside_crop(view, mean)
         && abs(projection.mean_px.x) < 1e6 && abs(projection.mean_px.y) < 1e6 && projection.covariance.x + projection.covariance.z < 1e12;

@@ -46,7 +46,7 @@ fn page_uses_its_token_and_shows_its_role() {
     let has_banner = |text: &'static str| move |browser: &mut Browser| browser.text("banner").contains(text);
     wait_for(&mut browser, "the reason", has_banner("This server requires a token"));
     std::fs::write(scratch.join("shared-no-token.png"), browser.screenshot()).expect("written");
-    let open = |browser: &mut Browser, token: &str| browser.evaluate(&format!("location.hash = '#token={token}'"));
+    let open = |browser: &mut Browser, token: &str| browser.load_by(&format!("location.hash = '#token={token}'"));
     open(&mut browser, "0123");
     wait_for(&mut browser, "the reason", has_banner("Invalid token"));
     browser.resize(PHONE_PX);

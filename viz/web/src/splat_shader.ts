@@ -76,7 +76,7 @@ ${TINT}
     ivec2 unitTexel = ivec2(int(unit % ${ROW_UNITS}u) * ${UNIT_TEXELS}, int(unit / ${ROW_UNITS}u));
     vec4 low = texelFetch(units, unitTexel, 0);
     vec4 grid = texelFetch(units, unitTexel + ivec2(1, 0), 0);
-    vec4 steps = texelFetch(units, unitTexel + ivec2(2, 0), 0); // log scale, coefficients of degree 1 and 2, 0 unused or 2 antialiased
+    vec4 steps = texelFetch(units, unitTexel + ivec2(2, 0), 0); // steps of log scale and of coefficients of degree 1 and 2; w: 0 unused, 1 in use, 2 in use and antialiased
     if (steps.w == 0.0) return;
     uvec4 words = texelFetch(base, texel, 0);
 

@@ -42,8 +42,8 @@ pub fn project_at(view: &View, splat: &Splat, row_share: f64) -> Projected {
     let [fx, fy] = view.focal_px;
     let [cx, cy] = view.principal_px;
     let point = parts.point_in_camera;
-    let narrowness = if view.is_antialiased { parts.narrowness() } else { 1.0 };
-    let opacity = sigmoid(splat.opacity_logit) * narrowness;
+    let compensation = if view.is_antialiased { parts.compensation() } else { 1.0 };
+    let opacity = sigmoid(splat.opacity_logit) * compensation;
     let reach = (2.0 * (opacity / MIN_ALPHA).ln()).max(0.0).sqrt(); // Standard deviations until alpha is MIN_ALPHA.
     Projected {
         mean_px: [fx * point.x / point.z + cx, fy * point.y / point.z + cy],
@@ -123,8 +123,8 @@ struct Parts {
 }
 
 impl Parts {
-    /// Area of the ellipse without the blur, as a fraction of that with it (Yu et al. 2024, equation 12).
-    fn narrowness(&self) -> f64 {
+    /// Opacity factor: area of the ellipse without the blur / area with it (Yu et al. 2024, equation 12).
+    fn compensation(&self) -> f64 {
         let without = self.cov_px2 - Matrix2::from_diagonal_element(BLUR_PX2);
         (without.determinant().max(0.0) / self.cov_px2.determinant()).sqrt()
     }
