@@ -36,7 +36,7 @@ pub struct DeviceStatistics {
     /// 99th percentile of the intervals between samples.
     pub gap_p99_millis: f64,
     /// Seconds by which the stamps advance per second of this computer, normally 1. `None` for simulated devices, and if the
-    /// samples arrived within less than [`MIN_RECEIVED_SECS`].
+    /// samples arrived within less than 0.5 s.
     pub stamp_secs_per_sec: Option<f64>,
 }
 
