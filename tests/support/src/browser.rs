@@ -134,9 +134,21 @@ impl Browser {
         }
     }
 
-    /// Value of a JavaScript expression.
+    /// Value of a JavaScript expression. It is evaluated again if a page is loaded in the meantime.
     pub fn evaluate(&mut self, expression: &str) -> Value {
-        let result = self.call("Runtime.evaluate", json!({"expression": expression, "returnByValue": true}));
+        const MAX_ATTEMPTS: u32 = 100;
+        let params = json!({"expression": expression, "returnByValue": true});
+        let is_replaced = |answer: &Value| answer["error"]["message"] == "Inspected target navigated or closed";
+        let mut answer = self.answer("Runtime.evaluate", params.clone());
+        for _ in 1..MAX_ATTEMPTS {
+            if !is_replaced(&answer) {
+                break;
+            }
+            std::thread::sleep(Duration::from_millis(20));
+            answer = self.answer("Runtime.evaluate", params.clone());
+        }
+        assert!(answer.get("error").is_none(), "{expression}: {answer}");
+        let result = answer["result"].clone();
         assert!(result.get("exceptionDetails").is_none(), "{expression}: {result}");
         result["result"]["value"].clone()
     }
