@@ -15,17 +15,16 @@ use kinematics::Stamp;
 use std::io::{ErrorKind, Read, Write};
 use std::net::{IpAddr, SocketAddr, TcpListener, TcpStream, UdpSocket};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
 /// Interval between states.
 const STEP: Duration = Duration::from_millis(1);
-/// Maximum lag of the thread. States with a smaller lag are sent late; states with a larger lag are skipped.
-const MAX_LAG: Duration = Duration::from_millis(100);
-/// Maximum lag during a motion. For each late state, the motion is extrapolated, which a real robot does for 20 states
-/// at most.
-const MAX_MOTION_LAG: Duration = Duration::from_millis(20);
+/// Maximum lag of the thread. States with a smaller lag are sent late; states with a larger lag are skipped. The receive
+/// buffer of a client holds about 40 states. For each late state of a motion, the motion is extrapolated, which a real
+/// robot does for 20 states at most.
+const MAX_LAG: Duration = Duration::from_millis(20);
 /// Maximum message size. Real clients stay far below it.
 const MAX_MESSAGE_BYTES: usize = 1 << 16;
 /// Maximum command size; longer datagrams are not commands.
@@ -35,6 +34,7 @@ const MAX_COMMAND_BYTES: usize = 512;
 #[derive(Debug)]
 pub struct EmulatedRobot {
     address: SocketAddr,
+    n_states_sent: Arc<AtomicU64>,
     stop: Arc<AtomicBool>,
     thread: Option<JoinHandle<()>>,
 }
@@ -69,7 +69,7 @@ impl EmulatedRobot {
         let listen = |source| Error::Listen { device: device.clone(), address: config.address, source };
         let (address, listener, states) = bind().map_err(listen)?;
         let joints = joint_simulator(clock::now(), &CommandedJoints::default());
-        let stop = Arc::new(AtomicBool::new(false));
+        let (n_states_sent, stop) = (Arc::default(), Arc::new(AtomicBool::new(false)));
         let mut server = Server {
             listener,
             states,
@@ -77,16 +77,22 @@ impl EmulatedRobot {
             joint_simulator,
             answer_wait,
             client: None,
+            n_states_sent: Arc::clone(&n_states_sent),
             stop: Arc::clone(&stop),
         };
         let thread = std::thread::Builder::new().name(device.clone()).spawn(move || server.run());
         let thread = thread.map_err(|source| Error::Thread { device, source })?;
-        Ok(Self { address, stop, thread: Some(thread) })
+        Ok(Self { address, n_states_sent, stop, thread: Some(thread) })
     }
 
     /// Address on which it accepts clients.
     pub fn address(&self) -> SocketAddr {
         self.address
+    }
+
+    /// Number of states that it has sent to its clients. A state that was due while its thread stalled is not sent.
+    pub fn n_states_sent(&self) -> u64 {
+        self.n_states_sent.load(Ordering::Relaxed)
     }
 }
 
@@ -108,6 +114,7 @@ struct Server {
     /// Maximum time by which an answer may be late during a motion.
     answer_wait: Duration,
     client: Option<Client>,
+    n_states_sent: Arc<AtomicU64>,
     stop: Arc<AtomicBool>,
 }
 
@@ -137,8 +144,7 @@ impl Server {
             let max_lag = match self.robot.commanded.is_moving {
                 // The answers to late states are awaited, too.
                 true if !self.answer_wait.is_zero() => Duration::MAX,
-                true => MAX_MOTION_LAG,
-                false => MAX_LAG,
+                _ => MAX_LAG,
             };
             if lag > max_lag {
                 let n_skipped = u32::try_from(lag.as_millis()).unwrap_or(u32::MAX);
@@ -175,8 +181,9 @@ impl Server {
                 return;
             }
             if let Some(states_to) = client.states_to {
-                // A state that cannot be sent counts as lost.
-                let _ = self.states.send_to(&self.robot.state(number), states_to);
+                // A client notices by its number that a state could not be sent.
+                let sent = self.states.send_to(&self.robot.state(number), states_to);
+                self.n_states_sent.fetch_add(u64::from(sent.is_ok()), Ordering::Relaxed);
             }
         }
     }

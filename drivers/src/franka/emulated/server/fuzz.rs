@@ -80,7 +80,16 @@ fn server(version: FciVersion, limits: Limits) -> Server {
         ..Joints::default()
     });
     let robot = Robot::new(config, Joints { position_rad: REST_RAD, ..Joints::default() });
-    Server { listener, states, robot, joint_simulator, answer_wait: Duration::ZERO, client: None, stop: Arc::default() }
+    Server {
+        listener,
+        states,
+        robot,
+        joint_simulator,
+        answer_wait: Duration::ZERO,
+        client: None,
+        n_states_sent: Arc::default(),
+        stop: Arc::default(),
+    }
 }
 
 /// A client accepted by the server, and its socket for commands.
