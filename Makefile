@@ -1,11 +1,12 @@
 # The same commands for developers and continuous integration; `make` without arguments lists them.
 #
-# As root, targets install missing dependencies (system packages with apt, the pinned MuJoCo library, the page's npm packages) and list
+# As root, targets install missing dependencies (system packages with apt, pinned libraries and programs, the page's npm packages) and list
 # them. Without root, they print the command that installs the system packages.
 
 .DEFAULT_GOAL := help
 .PHONY: help demo test quick test-gpu hil check fuzz deps web cargo packages test-packages check-packages mujoco realsense open-ends \
-	begin-test lint lint-without-features doc kernels manifests licenses
+	begin-test checks lint lint-without-features doc kernels manifests licenses texts web-check linters test-build test-crates \
+	test-program test-page test-hil
 # Cargo and npm already use all processors, and two runs of apt would block each other.
 .NOTPARALLEL:
 
@@ -31,16 +32,33 @@ RIG ?= static-arm
 LISTEN_SECONDS ?= 20
 
 help: ## List the targets
-	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-9s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-12s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
 demo: deps web ## Simulate a rig (RIG=static-arm, mobile-arm, mobile-base-small, ...) and serve the live scene; needs no display
 	cargo build --release $(FEATURES)
 	$(TARGET_FOLDER)/release/fieldrig run rigs/$(RIG).toml --sim
 
-test: begin-test test-packages lint lint-without-features doc manifests licenses web ## Run lints, documentation and all tests that need no device
-	@scripts/run-tests.py --steps $(STEPS) --report $(TARGET_FOLDER)/test-times.md -- --workspace $(TEST_FEATURES)
+RUN_TESTS = scripts/run-tests.py --steps $(STEPS) --report $(TARGET_FOLDER)/test-times.md
+test: begin-test test-packages checks web ## Run lints, documentation and all tests that need no device
+	@$(RUN_TESTS) -- --workspace $(TEST_FEATURES)
 
-quick: begin-test lint ## Run lints and the tests that need neither a GPU nor a browser
+# The tests of `make test` in parts, which continuous integration runs on several machines. Each part builds its tests with the same features
+# of all crates, so that they share one cache of dependencies.
+test-build: begin-test test-packages deps realsense web
+
+test-crates: test-build ## Run only the tests that are not in one of the three parts below
+	@$(RUN_TESTS) --only '^(?!fieldrig (program|hil)$$|viz viewer$$)' -- --workspace $(TEST_FEATURES)
+
+test-program: test-build ## Run only the tests of the whole program
+	@$(RUN_TESTS) --no-doc -- --workspace --test program $(TEST_FEATURES)
+
+test-page: test-build ## Run only the tests of the server and the page
+	@$(RUN_TESTS) --no-doc -- --workspace --test viewer $(TEST_FEATURES)
+
+test-hil: test-build ## Run only the tests in virtual machines
+	@$(RUN_TESTS) --no-doc -- --workspace --test hil $(TEST_FEATURES)
+
+quick: begin-test lint texts web-check ## Run lints and the tests that need neither a GPU nor a browser
 	@scripts/run-tests.py --steps $(STEPS) --no-doc --quick -- --workspace --lib --bins $(TEST_FEATURES)
 
 test-gpu: deps ## Run the tests that need a real GPU
@@ -54,7 +72,10 @@ hil: cargo packages web ## Check the devices of the rig RIG=file.toml: reads all
 	cargo build --release $(shell pkg-config --exists realsense2 2>/dev/null && echo --features realsense)
 	$(TARGET_FOLDER)/release/fieldrig doctor $(if $(filter file,$(origin RIG)),$(error RIG is not set; run: make hil RIG=file.toml),$(RIG)) --listen $(LISTEN_SECONDS)
 
-check: lint lint-without-features doc kernels manifests licenses ## Check format, clippy, documentation, kernels, licenses, to-do markers
+check: checks kernels ## Check format, clippy, documentation, kernels, spelling, licenses, the source of the page
+
+# What `make test` checks beside its tests.
+checks: texts lint lint-without-features doc manifests licenses web-check
 
 lint: check-packages deps realsense open-ends
 	@$(STEP) format cargo fmt --all --check
@@ -78,6 +99,12 @@ licenses: cargo
 		if cargo deny fetch db >/dev/null 2>&1; then cargo deny check advisories; \
 		else echo "cargo deny: advisories skipped, because their database is unreachable"; fi; \
 	else echo "cargo deny: skipped, because it is not installed (cargo install --locked cargo-deny)"; fi
+
+texts: linters
+	@$(STEP) "spelling, TOML" scripts/check-texts.sh
+
+web-check: packages ## Lint the source of the page, and run its unit tests
+	@$(STEP) "lint and unit tests of the page" scripts/check-web.sh
 
 # Duration per fuzz target in seconds.
 SECONDS ?= 600
@@ -106,6 +133,9 @@ check-packages: cargo
 
 mujoco: packages
 	@scripts/fetch-mujoco.sh
+
+linters: cargo packages
+	@scripts/fetch-linters.sh
 
 # Without the library, tests of RealSense cameras are skipped with a message, unless FIELDRIG_HIL=demand.
 realsense: check-packages

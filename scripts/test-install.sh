@@ -3,7 +3,7 @@
 #
 # For each state, the script sets up a chroot and checks install-packages.sh: with --check, it names exactly the missing packages; without
 # root, it prints one command to run and fails; as root, it installs the packages; a second run prints nothing. Then the script uses the
-# installed packages: it links a C program, opens Vulkan and EGL, generates bindings, and bundles the page.
+# installed packages: it links a C program, opens Vulkan and EGL, generates bindings, and bundles and tests the page.
 #
 # Needs root, debootstrap, network, and 4 GB in FOLDER. It is much faster if FOLDER is in memory, such as /dev/shm/test-install. Not part of
 # `make test`.
@@ -278,11 +278,16 @@ int main(void) {
 C
     inside scripts/fetch-mujoco.sh >>"$log" 2>&1 || fail "fetch-mujoco.sh, see $log"
     [ -z "$(inside scripts/fetch-mujoco.sh 2>&1)" ] || fail "a second fetch-mujoco.sh does not recognize the installed library"
+    inside 'scripts/fetch-linters.sh && scripts/check-texts.sh' >>"$log" 2>&1 || fail "fetch-linters.sh or check-texts.sh, see $log"
+    if inside scripts/fetch-linters.sh 2>&1 | grep -qv '^skipped'; then
+        fail "a second fetch-linters.sh does not recognize the installed programs"
+    fi
 }
 
 use_web() {
     inside scripts/build-web.sh >>"$log" 2>&1 || fail "build-web.sh, see $log"
     [ -s "$root/src/viz/web/dist/app.js" ] || fail "there is no bundle"
+    inside scripts/check-web.sh >>"$log" 2>&1 || fail "check-web.sh, see $log"
 }
 
 use_nokhwa() {

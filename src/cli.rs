@@ -23,9 +23,6 @@ pub(crate) struct Cli {
     /// Log debug messages on stderr; repeat to log everything
     #[arg(short, long, global = true, action = ArgAction::Count)]
     pub(crate) verbose: u8,
-    /// With `run`, `record` and `train`: create files with the permissions of your umask, instead of only for you
-    #[arg(long, global = true)]
-    pub(crate) public_files: bool,
     #[command(subcommand)]
     pub(crate) command: Command,
 }
@@ -66,9 +63,16 @@ pub(crate) enum Command {
 }
 
 impl Command {
-    /// Whether its results show where the robot was, so that other users of this computer must not read them.
+    /// Whether other users of this computer must not read its results, because they show where the robot was.
     pub(crate) fn is_private(&self) -> bool {
-        matches!(self, Self::Run(_) | Self::Record(_) | Self::Train(_))
+        let permissions = match self {
+            Self::Run(args) => args.permissions,
+            Self::Record(args) => args.permissions,
+            Self::Train(args) => args.permissions,
+            Self::Export(args) => args.permissions,
+            _ => return false,
+        };
+        !permissions.public_files
     }
 
     /// Runs the command.

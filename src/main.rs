@@ -7,8 +7,11 @@ mod commands;
 mod console;
 mod data_args;
 mod exit;
+#[cfg(test)]
+mod flag_tests;
 mod open_gpu;
 mod page_args;
+mod permission_args;
 mod print;
 mod served_page;
 mod signals;
@@ -21,7 +24,7 @@ fn main() -> ExitCode {
     keep_wayland_quiet();
     let cli = cli::Cli::parse();
     print::start_log(cli.verbose);
-    if cli.command.is_private() && !cli.public_files {
+    if cli.command.is_private() {
         // New folders get the mode 0700, and new files 0600.
         rustix::process::umask(rustix::fs::Mode::from_raw_mode(0o077));
     }

@@ -18,7 +18,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use trainer::gpu::Gpu;
 use trainer::splat::SplatOptions;
-use trainer::{MethodOptions, ModelKind, ModelOptions, ModelSpec};
+use trainer::{InitialPoints, MethodOptions, ModelKind, ModelOptions, ModelSpec};
 
 /// Folder of the runs inside the folder of the bench.
 const RUNS: &str = "bench-runs";
@@ -194,6 +194,8 @@ pub(crate) struct NamedData {
     pub(crate) name: String,
     pub(crate) path: PathBuf,
     pub(crate) data: Data,
+    /// Points from which models without depth start.
+    initial_points: Option<Arc<InitialPoints>>,
     /// The scene models requested by the flags and the recording.
     pub(crate) model_specs: Vec<ModelSpec>,
 }
@@ -312,7 +314,8 @@ impl<'a> Runs<'a> {
             return Err(Error::InsufficientData(format!("{}: {reason}", path.display())));
         }
         let model_specs = session::model_specs(training, &data, None, self.gpu.is_software())?;
-        Ok(NamedData { name: unique_name(path, used_names), path: path.to_owned(), data, model_specs })
+        let (name, initial_points) = (unique_name(path, used_names), data.initial_points());
+        Ok(NamedData { name, path: path.to_owned(), data, initial_points, model_specs })
     }
 
     /// Returns the run of a job from its file. If there is none, trains the run and saves it.
@@ -349,10 +352,7 @@ impl<'a> Runs<'a> {
                 bytes: outcome.bytes,
             },
         };
-        // Written to a temporary file first, so that an existing file is complete.
-        let unfinished = path.with_extension("part");
-        run_folder::write_json(&unfinished, &run)?;
-        std::fs::rename(&unfinished, &path).with_context(|| format!("cannot write {}", path.display()))?;
+        run_folder::write_json(&path, &run)?;
         self.report(&run, false);
         Ok(run)
     }
@@ -366,6 +366,8 @@ impl<'a> Runs<'a> {
         }
         let plan = TrainingPlan {
             model_spec,
+            // The points are not disturbed, and would reveal the true scene.
+            initial_points: job.data.initial_points.clone().filter(|_| job.disturbed.is_none()),
             evaluators: Evaluators {
                 during_training,
                 max_images_during_training: usize::MAX,

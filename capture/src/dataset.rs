@@ -1,7 +1,7 @@
 //! Converts the photos of a dataset to keyframes: decodes, undistorts, scales, and splits them.
 
-use crate::downscale;
 use crate::error::Context;
+use crate::{downscale, memory};
 use drivers::dataset::{Dataset, DatasetImage, DepthImage, ListedSplit};
 use keyframe::ensure;
 use keyframe::{DepthMap, Holdout, Keyframe, Split, counted};
@@ -12,6 +12,9 @@ use std::sync::{Arc, OnceLock};
 
 /// Name of the only camera of a dataset.
 const CAMERA: &str = "camera";
+/// Maximum number of pixels of the photos that are decoded at the same time, unless a single photo has more: 134 million.
+/// Each takes 4 to 12 bytes until the photo is scaled.
+const MAX_PX_AT_ONCE: u64 = 1 << 27;
 
 /// The photos of a dataset as keyframes: undistorted and scaled, with the poses of the dataset.
 #[derive(Debug)]
@@ -26,7 +29,7 @@ pub struct LoadedDataset {
     pub data_losses: Vec<String>,
 }
 
-/// Decodes all photos in parallel.
+/// Decodes all photos in parallel, few at a time if they are large.
 ///
 /// `holdout` assigns the splits; without it, the lists of the dataset do, or [`Holdout::default`] if it has none. `scale_frac` scales the undistorted photos (not their depth) by averaging areas; 1
 /// keeps their size. `on_progress` receives the number of finished photos, from any thread. A photo that does not decode
@@ -34,15 +37,30 @@ pub struct LoadedDataset {
 ///
 /// # Errors
 ///
-/// If no photo decodes, the scaled photos would be too small, or `holdout` does not match the names.
+/// If no photo decodes, the scaled photos would be too small or do not fit into memory, or `holdout` does not match the
+/// names.
 pub fn load(
     dataset: &Dataset,
     holdout: Option<&Holdout>,
     scale_frac: f64,
     on_progress: &(dyn Fn(usize) + Sync),
 ) -> crate::Result<LoadedDataset> {
+    load_few_at_once(dataset, holdout, scale_frac, MAX_PX_AT_ONCE, on_progress)
+}
+
+/// Loads as [`load`] does, and decodes photos with at most this many pixels in total at the same time.
+fn load_few_at_once(
+    dataset: &Dataset,
+    holdout: Option<&Holdout>,
+    scale_frac: f64,
+    max_px_at_once: u64,
+    on_progress: &(dyn Fn(usize) + Sync),
+) -> crate::Result<LoadedDataset> {
     for image in &dataset.images {
         downscale::intrinsics(&image.intrinsics, scale_frac).with_context(|| image.name.clone())?;
+    }
+    if let Some(available_bytes) = memory::available_bytes() {
+        check_memory(dataset, scale_frac, available_bytes)?;
     }
     let names: Vec<&str> = dataset.images.iter().map(|image| image.name.as_str()).collect();
     let listed = || dataset.images.iter().map(|image| image.listed.map(split_of)).collect::<Option<Vec<Split>>>();
@@ -72,8 +90,13 @@ pub fn load(
     let mut start = 0;
     for run in dataset.images.chunk_by(|a, b| a.intrinsics == b.intrinsics) {
         let lens = LensMaps::of(&run[0].intrinsics);
-        let jobs = run.par_iter().zip(&splits[start..start + run.len()]);
-        results.par_extend(jobs.map(|(image, split)| load_one((&lens, image, *split))));
+        let n_at_once = n_at_once(run[0].intrinsics.size_px, max_px_at_once, rayon::current_num_threads());
+        let n_at_once = n_at_once.unwrap_or(run.len());
+        let run_splits = &splits[start..start + run.len()];
+        for (images, image_splits) in run.chunks(n_at_once).zip(run_splits.chunks(n_at_once)) {
+            let jobs = images.par_iter().zip(image_splits);
+            results.par_extend(jobs.map(|(image, split)| load_one((&lens, image, *split))));
+        }
         start += run.len();
     }
 
@@ -110,6 +133,42 @@ pub fn load(
     Ok(loaded)
 }
 
+/// Number of photos of this size, at least 1, that are decoded at the same time, so that together they have at most
+/// `max_px` pixels; `None` if each thread may decode one.
+fn n_at_once(size_px: [u32; 2], max_px: u64, n_threads: usize) -> Option<usize> {
+    let n_px: u64 = size_px.map(u64::from).iter().product();
+    let n_photos = usize::try_from(max_px / n_px.max(1)).unwrap_or(usize::MAX);
+    (n_photos < n_threads).then_some(n_photos.max(1))
+}
+
+/// Checks that the photos fit into memory once they are scaled. Their depth images are not counted.
+///
+/// * `available_bytes`: memory that programs can still use.
+fn check_memory(dataset: &Dataset, scale_frac: f64, available_bytes: u64) -> crate::Result<()> {
+    let n_bytes: u64 = dataset
+        .images
+        .iter()
+        .map(|image| 4 * image.intrinsics.scaled(scale_frac).size_px.map(u64::from).iter().product::<u64>())
+        .sum();
+    if n_bytes <= available_bytes {
+        return Ok(());
+    }
+    let fitting = scale_frac * (available_bytes as f64 / n_bytes as f64).sqrt();
+    let remedy = match (100.0 * fitting).floor() / 100.0 {
+        scale if scale >= downscale::MIN_SCALE => {
+            format!("scale them to {scale} or less (--scale of `fieldrig train`, `eval` and `bench`)")
+        }
+        _ => "use fewer photos".to_owned(),
+    };
+    Err(crate::Error::BadInput(format!(
+        "{}: {} take {:.1} GB of memory, but only {:.1} GB are available: {remedy}",
+        dataset.path.display(),
+        counted(dataset.images.len() as u64, "photo"),
+        n_bytes as f64 / 1e9,
+        available_bytes as f64 / 1e9
+    )))
+}
+
 fn split_of(listed: ListedSplit) -> Split {
     match listed {
         ListedSplit::Train => Split::Train,
@@ -118,11 +177,10 @@ fn split_of(listed: ListedSplit) -> Split {
     }
 }
 
-/// The first messages in one line.
+/// The first messages in one line, and how many more there are.
 fn first_of(errors: &[String]) -> String {
     const MAX_SHOWN: usize = 3;
-    let more = if errors.len() > MAX_SHOWN { "; ..." } else { "" };
-    format!("{}{more}", errors[..errors.len().min(MAX_SHOWN)].join("; "))
+    kinematics::shortened(errors, MAX_SHOWN, "; ")
 }
 
 /// Undistortion maps of one lens; empty for a lens without distortion.
@@ -138,10 +196,12 @@ impl LensMaps {
         Self { color, depth: OnceLock::new() }
     }
 
-    fn undistorted_color(&self, rgba: Vec<u8>) -> Result<Vec<u8>, kinematics::Error> {
+    /// Undistorts and scales a photo. If it becomes smaller, the undistorted photo is never in memory.
+    fn scaled_color(&self, rgba: Vec<u8>, from_px: [u32; 2], to_px: [u32; 2]) -> Result<Vec<u8>, kinematics::Error> {
         match &self.color {
-            Some(map) => map.apply_rgba(&rgba),
-            None => Ok(rgba),
+            None => Ok(downscale::rgba(rgba, from_px, to_px)),
+            Some(map) if from_px == to_px => Ok(downscale::rgba(map.apply_rgba(&rgba)?, from_px, to_px)),
+            Some(map) => Ok(downscale::rgba_of_rows(from_px, to_px, map.rgba_rows(&rgba)?)),
         }
     }
 
@@ -180,9 +240,8 @@ fn keyframe(lens: &LensMaps, image: &DatasetImage, scale_frac: f64) -> crate::Re
         })
     });
     let depth = depth.transpose()?;
-    let rgba = lens.undistorted_color(loaded.rgba_srgb).with_context(in_image)?;
     let scaled = image.intrinsics.scaled(scale_frac);
-    let rgba = downscale::rgba(rgba, image.intrinsics.size_px, scaled.size_px);
+    let rgba = lens.scaled_color(loaded.rgba_srgb, image.intrinsics.size_px, scaled.size_px).with_context(in_image)?;
     let keyframe = Keyframe {
         camera: CAMERA.into(),
         stamp: image.stamp,

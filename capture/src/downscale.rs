@@ -5,8 +5,10 @@ use kinematics::Intrinsics;
 
 /// Minimum side of a scaled image in pixels: smaller images contain too little detail for training.
 const MIN_SIDE_PX: u32 = 16;
+/// Minimum fraction of the width and height.
+pub(crate) const MIN_SCALE: f64 = 0.05;
 /// Allowed fractions of the width and height.
-const SCALE_RANGE: std::ops::RangeInclusive<f64> = 0.05..=1.0;
+const SCALE_RANGE: std::ops::RangeInclusive<f64> = MIN_SCALE..=1.0;
 
 /// Parses a scale factor for the width and height of training images, such as `0.5`.
 ///
@@ -38,7 +40,22 @@ pub(crate) fn intrinsics(full: &Intrinsics, share: f64) -> Result<Intrinsics, Er
 /// that no masked content leaks into the result.
 #[must_use]
 pub fn rgba(rgba: Vec<u8>, from_px: [u32; 2], to_px: [u32; 2]) -> Vec<u8> {
-    let mut rgba = if from_px == to_px { rgba } else { area_mean(&rgba, from_px, to_px) };
+    if from_px == to_px {
+        return with_binary_alpha(rgba);
+    }
+    let row_bytes = 4 * from_px[0] as usize;
+    rgba_of_rows(from_px, to_px, |row, to| to.copy_from_slice(&rgba[row * row_bytes..(row + 1) * row_bytes]))
+}
+
+/// Scales an image as [`rgba`] does, but to a smaller size, and without holding it in memory.
+///
+/// * `write_row`: writes the row of the image with the given index to `[width, 4]`. It is called once per row, in order.
+pub(crate) fn rgba_of_rows(from_px: [u32; 2], to_px: [u32; 2], write_row: impl FnMut(usize, &mut [u8])) -> Vec<u8> {
+    with_binary_alpha(area_mean(from_px, to_px, write_row))
+}
+
+/// Masks all pixels that are not completely opaque.
+fn with_binary_alpha(mut rgba: Vec<u8>) -> Vec<u8> {
     for alpha in rgba.iter_mut().skip(3).step_by(4) {
         *alpha = if *alpha == 255 { 255 } else { 0 };
     }
@@ -46,16 +63,21 @@ pub fn rgba(rgba: Vec<u8>, from_px: [u32; 2], to_px: [u32; 2]) -> Vec<u8> {
 }
 
 /// Shrinks `[height, width, 4]`. Each new pixel is the mean over the area it covers, including fractions of pixels.
-fn area_mean(rgba: &[u8], from_px: [u32; 2], to_px: [u32; 2]) -> Vec<u8> {
+fn area_mean(from_px: [u32; 2], to_px: [u32; 2], mut write_row: impl FnMut(usize, &mut [u8])) -> Vec<u8> {
     let [from_width, to_width] = [from_px[0] as usize, to_px[0] as usize];
     let (columns, rows) = (coverage(from_px[0], to_px[0]), coverage(from_px[1], to_px[1]));
     let mut out = Vec::with_capacity(4 * to_width * rows.len());
     let mut sums = vec![[0.0_f32; 4]; from_width];
+    let (mut row, mut row_y) = (vec![0; 4 * from_width], None);
     for covered_rows in &rows {
         sums.fill([0.0; 4]);
         for &(y, share) in covered_rows {
-            let row = rgba[4 * y * from_width..4 * (y + 1) * from_width].as_chunks::<4>().0;
-            for (sum, pixel) in sums.iter_mut().zip(row) {
+            // The last old row of a new row may also be the first of the next one.
+            if row_y != Some(y) {
+                write_row(y, &mut row);
+                row_y = Some(y);
+            }
+            for (sum, pixel) in sums.iter_mut().zip(row.as_chunks::<4>().0) {
                 (0..4).for_each(|channel| sum[channel] += share * f32::from(pixel[channel]));
             }
         }
@@ -94,6 +116,25 @@ mod tests {
         let shares = coverage(5, 2);
         assert_eq!(shares[0], [(0, 0.4), (1, 0.4), (2, 0.2)]);
         assert_eq!(shares[1], [(2, 0.2), (3, 0.4), (4, 0.4)]);
+    }
+
+    #[test]
+    fn rows_are_read_once_and_in_order() {
+        const SIZE_PX: [u32; 2] = [5, 7];
+        let image: Vec<u8> = (0..4 * 5 * 7).map(|ix| if ix % 4 == 3 && ix != 43 { 255 } else { ix }).collect();
+        for to_px in [[2, 3], [4, 6], [1, 1], [5, 2]] {
+            let mut read = Vec::new();
+            let scaled = rgba_of_rows(SIZE_PX, to_px, |row, to| {
+                read.push(row);
+                to.copy_from_slice(&image[20 * row..20 * (row + 1)]);
+            });
+            assert_eq!(read, (0..7).collect::<Vec<_>>());
+            assert_eq!(scaled, rgba(image.clone(), SIZE_PX, to_px));
+            assert_eq!(scaled.len(), 4 * (to_px[0] * to_px[1]) as usize);
+            assert!(scaled.chunks(4).any(|pixel| pixel[3] == 0), "one pixel is masked");
+        }
+        // The mean of columns 0 to 4 and rows 0 to 6.
+        assert_eq!(rgba(image, SIZE_PX, [1, 1])[..3], [68, 69, 70]);
     }
 
     #[test]

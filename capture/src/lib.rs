@@ -38,6 +38,7 @@ pub mod downscale;
 mod error;
 mod feed;
 mod join;
+mod memory;
 mod nearest_name;
 mod notes;
 pub mod open;

@@ -163,14 +163,65 @@ fn arm_that_reports_nothing_is_stopped() {
 /// camera in real time.
 #[cfg(target_os = "linux")]
 mod emulated_controller {
-    use super::{ArmCapture, Devices, Override, Path, Rig, Stop, open, rotated};
+    use super::{
+        Arm, ArmCapture, Devices, Error, JOINT, JointState, JointTarget, Motion, MovableArm, Override, Path, Rig, Stop,
+        open, rotated,
+    };
     use std::time::{Duration, Instant};
 
     /// The emulated controller stops the arm if the computer is too busy to answer in time, as a real one does.
     const BUSY: &str = "communication_constraints_violation";
     const MAX_ATTEMPTS: usize = 3;
 
+    /// An arm that requests a stop once its joint has moved by this much. A time would depend on the load of the computer.
+    struct StoppedOnTheWay {
+        arm: Box<dyn MovableArm>,
+        after_rad: f64,
+        start_rad: Option<f64>,
+        stop: Stop,
+    }
+
+    impl Arm for StoppedOnTheWay {
+        fn joint_names(&self) -> &[String] {
+            self.arm.joint_names()
+        }
+
+        fn read(&mut self, timeout: Duration) -> Result<JointState, Error> {
+            let state = self.arm.read(timeout)?;
+            let position = state.position[JOINT];
+            if (position - *self.start_rad.get_or_insert(position)).abs() > self.after_rad {
+                self.stop.request();
+            }
+            Ok(state)
+        }
+    }
+
+    impl MovableArm for StoppedOnTheWay {
+        fn command(&mut self, target: &JointTarget) -> Result<JointTarget, Error> {
+            self.arm.command(target)
+        }
+
+        fn motion(&self) -> Motion {
+            self.arm.motion()
+        }
+
+        fn stop(&mut self) -> Result<(), Error> {
+            self.arm.stop()
+        }
+
+        fn recover(&mut self) -> Result<(), Error> {
+            self.arm.recover()
+        }
+    }
+
     fn connected(rate_hz: f64) -> capture::Result<(ArmCapture, Vec<f64>)> {
+        connected_as(rate_hz, |arm| arm)
+    }
+
+    fn connected_as(
+        rate_hz: f64,
+        wrap: impl FnOnce(Box<dyn MovableArm>) -> Box<dyn MovableArm>,
+    ) -> capture::Result<(ArmCapture, Vec<f64>)> {
         let overrides = [
             Override::new("arm.driver", "franka"),
             Override::new("arm.motion.on_loss", "hold"),
@@ -179,7 +230,9 @@ mod emulated_controller {
         ];
         let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("../rigs/calibration-board.toml");
         let rig = Rig::load(&file, &overrides).expect("a bundled rig file");
-        let mut capture = ArmCapture::new(open::movable(&rig, Devices::Sim, "wrist")?)?;
+        let mut movable = open::movable(&rig, Devices::Sim, "wrist")?;
+        movable.arm = wrap(movable.arm);
+        let mut capture = ArmCapture::new(movable)?;
         let start = capture.joints()?;
         Ok((capture, start))
     }
@@ -263,12 +316,17 @@ mod emulated_controller {
     #[test]
     fn stop_during_a_motion_brings_the_arm_to_rest() {
         unless_busy(|| {
-            let (mut capture, start) = connected(2.0)?;
-            let goal = rotated(&start, 0.24);
-            assert!(!capture.move_to(&goal, &requested_after(0.4))?, "the stop was requested on the way");
+            let stop = Stop::default();
+            let on_the_way = stop.clone();
+            let (mut capture, start) = connected_as(2.0, |arm| {
+                Box::new(StoppedOnTheWay { arm, after_rad: 0.1, start_rad: None, stop: on_the_way })
+            })?;
+            // Three steps. If this thread is not scheduled for long, the arm completes the first one.
+            let goal = rotated(&start, 0.6);
+            assert!(!capture.move_to(&goal, &stop)?, "the stop was requested on the way");
             let (rest, drift) = joints_and_drift(&mut capture)?;
             assert!(drift < 1e-4, "{drift}");
-            assert!(distance(&rest, &start) > 1e-3 && distance(&rest, &goal) > 0.01, "{rest:?}");
+            assert!(distance(&rest, &start) > 0.05 && distance(&rest, &goal) > 0.3, "{rest:?}, started at {start:?}");
             Ok(())
         });
     }

@@ -244,10 +244,12 @@ pub enum Error {
         path: PathBuf,
     },
     /// The recording contains no samples of a rig.
-    #[error("the recording {path:?} contains no images or joint states recorded by this program")]
+    #[error("the recording {path:?} contains no images or joint states recorded by this program{reason}")]
     EmptyRecording {
         /// The file.
         path: PathBuf,
+        /// Damage or other contents of the file, after a semicolon; empty if there are none.
+        reason: String,
     },
     /// The file for a new recording already exists.
     #[error("{path:?} exists already: choose a new file for the recording")]
@@ -272,6 +274,16 @@ pub enum Error {
         path: PathBuf,
         /// Error of the operating system.
         source: std::io::Error,
+    },
+    /// A topic of a recording has other contents than its name requires.
+    #[error("the recording {path:?}: topic {topic:?}: {reason}")]
+    BrokenTopic {
+        /// The file.
+        path: PathBuf,
+        /// The topic.
+        topic: String,
+        /// Contents found and expected.
+        reason: String,
     },
     /// A message of a recording cannot be decoded.
     #[error("the recording {path:?} contains a malformed message on {topic:?}")]
@@ -336,7 +348,7 @@ pub enum Error {
         format: &'static str,
     },
     /// An image of a dataset is too large for the memory of most computers.
-    #[error("{path:?} has {}x{} pixels, which exceeds the maximum of {max_px}; scale the image down", .got_px[0], .got_px[1])]
+    #[error("{path:?} has {}x{} pixels, which exceeds the maximum of {max_px}; resize the file, because images are scaled only after they are decoded", .got_px[0], .got_px[1])]
     TooManyPixels {
         /// The file.
         path: PathBuf,

@@ -1,20 +1,33 @@
-//! Removes output files and folders that were not written completely.
+//! Names and removes output files and folders that were not written completely.
 //!
-//! A [`Partial`] removes what was created after an error or a signal, unless [`Partial::keep`] was called. Unfinished files of
-//! [`create`](crate::create) and [`replace`](crate::replace) are removed in the same way.
+//! After an error or a signal, the writing functions of this crate remove what they have not finished. What a killed program
+//! leaves behind is removed when the same file is written again.
 
 use parking_lot::{Mutex, MutexGuard};
 use std::collections::BTreeSet;
+use std::ffi::OsStr;
+use std::io::{Error, ErrorKind};
+use std::os::unix::ffi::OsStrExt;
 use std::path::{Path, PathBuf};
 
 /// The files and folders that this process is writing.
 static IN_PROGRESS: Mutex<BTreeSet<PathBuf>> = Mutex::new(BTreeSet::new());
 
-/// Temporary path of a file that is being written: the path with `.part` appended.
+/// Start and end of temporary names. No other program uses them, so what has such a name and is not locked is a leftover of
+/// this program and can be removed. A name like `scene.ply.part` could be that of an unfinished download.
+const PREFIX: &[u8] = b".";
+const SUFFIX: &[u8] = b".fieldrig.part";
+/// Maximum length of a file name on Linux and macOS.
+const MAX_NAME_BYTES: usize = 255;
+
+/// Temporary path of a file or folder that is being written: `.NAME.fieldrig.part` in the same folder.
+///
+/// It depends only on the path, so that programs that write the same file at the same time notice each other.
 pub fn path_of(path: &Path) -> PathBuf {
-    let mut partial = path.as_os_str().to_owned();
-    partial.push(".part");
-    partial.into()
+    let name = path.file_name().unwrap_or_default().as_bytes();
+    // Very long names are cut. Two that begin with the same letters exclude each other, as if they were the same.
+    let name = &name[..name.len().min(MAX_NAME_BYTES - PREFIX.len() - SUFFIX.len())];
+    path.with_file_name(OsStr::from_bytes(&[PREFIX, name, SUFFIX].concat()))
 }
 
 /// A path that is removed on drop, and by [`remove_all`].
@@ -45,41 +58,6 @@ impl Drop for Registered {
     }
 }
 
-/// A folder being written; removed on drop unless [`Self::keep`] is called.
-#[derive(Debug)]
-#[must_use = "dropping it removes its files"]
-pub struct Partial(Vec<PathBuf>);
-
-impl Partial {
-    /// A folder that will be filled with `entries`. If the folder exists already, only the entries are removed on drop,
-    /// except those that exist already.
-    pub fn folder(path: &Path, entries: &[&str]) -> Self {
-        let paths = match path.exists() {
-            true => entries.iter().map(|entry| path.join(entry)).collect(),
-            false => vec![path.to_owned()],
-        };
-        let paths: Vec<PathBuf> = paths.into_iter().filter(|path| !path.exists()).collect();
-        IN_PROGRESS.lock().extend(paths.iter().cloned());
-        Self(paths)
-    }
-
-    /// Keeps the files once they are complete.
-    pub fn keep(mut self) {
-        let paths = std::mem::take(&mut self.0);
-        IN_PROGRESS.lock().retain(|path| !paths.contains(path));
-    }
-}
-
-impl Drop for Partial {
-    fn drop(&mut self) {
-        let mut in_progress = IN_PROGRESS.lock();
-        for path in &self.0 {
-            remove(path);
-            in_progress.remove(path);
-        }
-    }
-}
-
 /// Prevents the start of new files as long as it exists.
 #[must_use = "dropping it allows new files"]
 pub struct NoNewFiles {
@@ -93,16 +71,46 @@ pub fn remove_all() -> NoNewFiles {
     NoNewFiles { _in_progress: in_progress }
 }
 
-/// Removes a file, a link or a folder, if it is there.
-pub(crate) fn remove(path: &Path) {
-    let is_folder = path.symlink_metadata().is_ok_and(|metadata| metadata.is_dir());
-    let removed = if is_folder { std::fs::remove_dir_all(path) } else { std::fs::remove_file(path) };
-    match removed {
-        Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
-            log::warn!("cannot remove the incomplete output {}: {error}", path.display());
+/// Removes the temporary file or folder that a killed program left at a path of [`path_of`], if there is one. A folder is
+/// removed only if it contains nothing but entries with these names, complete or not.
+///
+/// # Errors
+/// If the folder has other entries, or cannot be removed.
+pub fn remove_leftover(unfinished: &Path, names: &[&OsStr]) -> std::io::Result<()> {
+    let cannot_remove =
+        |error: Error| Error::new(error.kind(), format!("cannot remove {}: {error}", unfinished.display()));
+    if is_folder(unfinished) {
+        let own_paths: Vec<PathBuf> = names.iter().map(|name| unfinished.join(name)).collect();
+        let is_own = |entry: &Path| own_paths.iter().any(|own| entry == own || entry == path_of(own));
+        let mut entries = std::fs::read_dir(unfinished).map_err(cannot_remove)?.flatten();
+        if entries.any(|entry| !is_own(&entry.path())) {
+            return Err(Error::new(
+                ErrorKind::AlreadyExists,
+                format!("{} is a folder with other files; remove it, or choose another name", unfinished.display()),
+            ));
         }
-        _ => {}
     }
+    remove_any(unfinished).map_err(cannot_remove)
+}
+
+/// Removes a file, a link or a folder, if it is there; warns if this fails.
+fn remove(path: &Path) {
+    if let Err(error) = remove_any(path) {
+        log::warn!("cannot remove the incomplete output {}: {error}", path.display());
+    }
+}
+
+fn remove_any(path: &Path) -> std::io::Result<()> {
+    let removed = if is_folder(path) { std::fs::remove_dir_all(path) } else { std::fs::remove_file(path) };
+    match removed {
+        Err(error) if error.kind() == ErrorKind::NotFound => Ok(()),
+        removed => removed,
+    }
+}
+
+/// Whether a path is a folder, and not a link to one.
+fn is_folder(path: &Path) -> bool {
+    path.symlink_metadata().is_ok_and(|metadata| metadata.is_dir())
 }
 
 #[cfg(test)]
@@ -110,27 +118,36 @@ mod tests {
     use super::*;
 
     #[test]
-    fn partial_folders_are_removed_unless_kept() {
+    fn temporary_names_are_beside_the_file_and_not_too_long() {
+        for (path, unfinished) in [
+            ("scene.ply", ".scene.ply.fieldrig.part"),
+            ("a/scan", "a/.scan.fieldrig.part"),
+            ("a/scan/", "a/.scan.fieldrig.part"),
+            ("/scan", "/.scan.fieldrig.part"),
+        ] {
+            assert_eq!(path_of(Path::new(path)), Path::new(unfinished), "{path}");
+        }
+        let folder = tempfile::tempdir().expect("a folder");
+        for n_bytes in [200, 240, 241, 255] {
+            let path = folder.path().join("x".repeat(n_bytes));
+            std::fs::write(path_of(&path), "fits").expect("a valid name");
+            crate::write(&path, "complete").expect("a valid name");
+            assert!(path.exists() && !path_of(&path).exists(), "{n_bytes}");
+        }
+    }
+
+    #[test]
+    fn registered_paths_are_removed_unless_disarmed() {
         let folder = tempfile::tempdir().expect("a folder");
         let at = |name: &str| folder.path().join(name);
-        for keeps in [false, true] {
-            let (new, existing) =
-                (Partial::folder(&at("new"), &["images"]), Partial::folder(folder.path(), &["images", "test.txt"]));
-            for name in ["other", "test.txt"] {
-                std::fs::write(at(name), b"x").expect("disk space");
-            }
-            std::fs::create_dir_all(at("new/depth")).expect("disk space");
-            std::fs::create_dir_all(at("images/a")).expect("disk space");
-            if keeps {
-                [new, existing].into_iter().for_each(Partial::keep);
-            } else {
-                drop([new, existing]);
-            }
-            let exist = ["new", "images", "test.txt"].map(|name| at(name).exists());
-            assert_eq!(exist, [keeps; 3]);
-            assert!(at("other").exists());
-        }
-        drop(Partial::folder(&at("new"), &["depth"]));
-        assert!(at("new/depth").exists(), "it existed before");
+        let registered = ["dropped", "kept"].map(|name| {
+            std::fs::create_dir_all(at(name).join("depth")).expect("disk space");
+            std::fs::write(at(name).join("depth/0.png"), b"x").expect("disk space");
+            Registered::new(&at(name))
+        });
+        let [dropped, mut kept] = registered;
+        kept.disarm();
+        drop((dropped, kept));
+        assert_eq!(["dropped", "kept"].map(|name| at(name).exists()), [false, true]);
     }
 }

@@ -1,14 +1,10 @@
 //! Opens files for reading.
 
+use crate::Budget;
 use std::fs::{File, OpenOptions};
 use std::io::{Error, ErrorKind, Read};
 use std::os::unix::fs::{FileTypeExt, OpenOptionsExt};
 use std::path::Path;
-
-/// Maximum size of texts: rig files, robot descriptions, lists, reports.
-pub const MAX_TEXT_BYTES: u64 = 64 << 20;
-/// For files whose size is limited by the disk only.
-pub const NO_LIMIT: u64 = u64::MAX;
 
 /// Opens a regular file for reading.
 ///
@@ -40,34 +36,28 @@ fn check_type(kind: &std::fs::FileType) -> std::io::Result<()> {
     Err(Error::new(ErrorKind::InvalidInput, format!("it is {what}; expected a file")))
 }
 
-/// Reads a regular file of at most `max_bytes`.
+/// Reads a regular file within a budget.
 ///
 /// # Errors
 /// If the file cannot be opened or read, is not a regular file, or is larger.
-pub fn read(path: &Path, max_bytes: u64) -> std::io::Result<Vec<u8>> {
+pub fn read(path: &Path, budget: Budget) -> std::io::Result<Vec<u8>> {
     let file = open(path)?;
     let n_bytes = file.metadata()?.len();
-    let too_large =
-        |n_bytes| Error::new(ErrorKind::FileTooLarge, format!("it has {n_bytes} bytes, at most {max_bytes} are read"));
-    if n_bytes > max_bytes {
-        return Err(too_large(n_bytes));
-    }
+    budget.check_bytes(n_bytes)?;
     let mut bytes = Vec::new();
     bytes.try_reserve_exact(usize::try_from(n_bytes).unwrap_or(usize::MAX))?;
     // The file may grow, and files in /proc have no size.
-    file.take(max_bytes.saturating_add(1)).read_to_end(&mut bytes)?;
-    if bytes.len() as u64 > max_bytes {
-        return Err(too_large(bytes.len() as u64));
-    }
+    file.take(budget.max_bytes.saturating_add(1)).read_to_end(&mut bytes)?;
+    budget.check_bytes(bytes.len() as u64)?;
     Ok(bytes)
 }
 
-/// Reads a text in UTF-8 of at most [`MAX_TEXT_BYTES`], without its byte order mark.
+/// Reads a text in UTF-8 within [`Budget::TEXT`], without its byte order mark.
 ///
 /// # Errors
 /// As [`read`], and if the file is not UTF-8.
 pub fn read_text(path: &Path) -> std::io::Result<String> {
-    let bytes = read(path, MAX_TEXT_BYTES)?;
+    let bytes = read(path, Budget::TEXT)?;
     let is_utf_16 = [[0xFF, 0xFE], [0xFE, 0xFF]].iter().any(|mark| bytes.starts_with(mark));
     let mut text = String::from_utf8(bytes).map_err(|_| {
         let found = if is_utf_16 { "it is UTF-16 text; save it as UTF-8" } else { "it is not UTF-8 text" };
@@ -89,26 +79,27 @@ mod tests {
     fn only_regular_files_up_to_the_limit_are_read() {
         let folder = tempfile::tempdir().expect("a folder");
         let at = |name: &str| folder.path().join(name);
+        let of_bytes = |max_bytes| Budget { max_bytes, ..Budget::TEXT };
         std::fs::write(at("text"), "twelve bytes").expect("written");
         symlink(at("text"), at("link")).expect("a link");
-        assert_eq!(read(&at("link"), 12).expect("a link to a file"), b"twelve bytes");
+        assert_eq!(read(&at("link"), of_bytes(12)).expect("a link to a file"), b"twelve bytes");
         assert_eq!(read_text(&at("text")).expect("text"), "twelve bytes");
-        assert_eq!(read(&at("text"), 11).expect_err("too large").kind(), ErrorKind::FileTooLarge);
+        assert_eq!(read(&at("text"), of_bytes(11)).expect_err("too large").kind(), ErrorKind::FileTooLarge);
         std::fs::write(at("latin"), [b'a', 0xE4]).expect("written");
         assert_eq!(read_text(&at("latin")).expect_err("not UTF-8").to_string(), "it is not UTF-8 text");
         std::fs::write(at("marked"), "\u{FEFF}text").expect("written");
         assert_eq!(read_text(&at("marked")).expect("text"), "text");
         std::fs::write(at("wide"), [0xFF, 0xFE, b'a', 0]).expect("written");
         assert_eq!(read_text(&at("wide")).expect_err("UTF-16").to_string(), "it is UTF-16 text; save it as UTF-8");
-        assert_eq!(read(&at("absent"), 1).expect_err("absent").kind(), ErrorKind::NotFound);
-        assert_eq!(read(folder.path(), 1).expect_err("a folder").to_string(), "it is a folder");
+        assert_eq!(read(&at("absent"), of_bytes(1)).expect_err("absent").kind(), ErrorKind::NotFound);
+        assert_eq!(read(folder.path(), of_bytes(1)).expect_err("a folder").to_string(), "it is a folder");
         let made = Command::new("mkfifo").arg(at("pipe")).status().expect("mkfifo is part of every system");
         assert!(made.success());
         symlink("/dev/zero", at("zero")).expect("a link");
         for (name, what) in [("pipe", "it is a pipe"), ("zero", "it is a device")] {
-            let error = read(&at(name), NO_LIMIT).expect_err("not a file").to_string();
+            let error = read(&at(name), Budget::PLAIN).expect_err("not a file").to_string();
             assert!(error.starts_with(what), "{error}");
         }
-        assert!(read(Path::new("/proc/self/status"), MAX_TEXT_BYTES).expect("a file without a size").len() > 100);
+        assert!(read(Path::new("/proc/self/status"), Budget::TEXT).expect("a file without a size").len() > 100);
     }
 }

@@ -61,6 +61,35 @@ pub fn create_from<T, E: From<Error>>(path: &Path, write: impl FnOnce(&Path) -> 
     Ok(written)
 }
 
+/// Calls `write` with a path in a temporary folder, where it writes a folder, and moves this folder to `path`. If `path` is
+/// a folder already, those of its `entries` that were written are moved into it, in this order: a killed program may leave
+/// the first ones, so the last one should be the one that readers look for.
+///
+/// # Errors
+/// The errors of `write`, and those of [`create`]. What has been moved is removed again.
+pub fn create_folder<T, E: From<Error>>(
+    path: &Path,
+    entries: &[&str],
+    write: impl FnOnce(&Path) -> Result<T, E>,
+) -> Result<T, E> {
+    const CONTENTS: &str = "contents";
+    if !path.is_dir() {
+        return create_from(path, write);
+    }
+    let contents = path.join(CONTENTS);
+    let unfinished = Unfinished::folder(&contents)?;
+    let inside = unfinished.path.join(CONTENTS);
+    let written = write(&inside)?;
+    let mut moved = Vec::new();
+    for entry in entries.iter().filter(|entry| inside.join(entry).exists()) {
+        publish(&inside.join(entry), &path.join(entry))?;
+        moved.push(Registered::new(&path.join(entry)));
+    }
+    sync_parent(&contents)?;
+    moved.iter_mut().for_each(Registered::disarm);
+    Ok(written)
+}
+
 fn exists() -> Error {
     Error::new(ErrorKind::AlreadyExists, "it exists already")
 }
@@ -104,7 +133,7 @@ fn sync_parent(path: &Path) -> std::io::Result<()> {
     }
 }
 
-/// A file or folder with the suffix `.part`, locked by this process; removed on drop if it is still there.
+/// A file or folder with a temporary name, locked by this process; removed on drop if it is still there.
 struct Unfinished {
     path: PathBuf,
     /// Declared before `file`: fields drop in order, so the path is removed while it is still locked.
@@ -134,6 +163,7 @@ impl Unfinished {
         const MAX_ATTEMPTS: usize = 100;
         let busy = || Error::new(ErrorKind::ResourceBusy, "another program is writing it");
         let unfinished = partial::path_of(path);
+        let name = path.file_name().unwrap_or_default();
         for _ in 0..MAX_ATTEMPTS {
             match make(&unfinished) {
                 Ok(None) => {}
@@ -148,11 +178,13 @@ impl Unfinished {
                     match rustix::fs::open(&unfinished, flags, Mode::empty()).map(File::from) {
                         Ok(leftover) if !try_lock(&leftover)? => return Err(busy()),
                         // Holding the lock keeps other programs from removing a new file at this path in the meantime.
-                        Ok(leftover) if is_at(&leftover, &unfinished) => remove_leftover(&unfinished, path)?,
+                        Ok(leftover) if is_at(&leftover, &unfinished) => {
+                            partial::remove_leftover(&unfinished, &[name])?;
+                        }
                         // Its program has just published or removed it.
                         Ok(_) | Err(rustix::io::Errno::NOENT) => {}
                         // A symbolic link and a socket cannot be opened, and no program is writing them.
-                        Err(_) => remove_leftover(&unfinished, path)?,
+                        Err(_) => partial::remove_leftover(&unfinished, &[name])?,
                     }
                 }
                 Err(error) => return Err(error),
@@ -160,22 +192,6 @@ impl Unfinished {
         }
         Err(busy())
     }
-}
-
-/// Removes a temporary file or folder that a killed program left behind. A folder is removed only if it contains nothing but the file that was to be written.
-fn remove_leftover(unfinished: &Path, path: &Path) -> std::io::Result<()> {
-    let inside = unfinished.join(path.file_name().unwrap_or_default());
-    let own = [partial::path_of(&inside), inside];
-    if unfinished.symlink_metadata().is_ok_and(|metadata| metadata.is_dir())
-        && std::fs::read_dir(unfinished)?.flatten().any(|entry| !own.contains(&entry.path()))
-    {
-        return Err(Error::new(
-            ErrorKind::AlreadyExists,
-            format!("{} is a folder with other files; remove it, or choose another name", unfinished.display()),
-        ));
-    }
-    partial::remove(unfinished);
-    Ok(())
 }
 
 /// Takes the lock of an open file; returns whether it was free. On a file system without locks, always returns true.
@@ -262,9 +278,12 @@ mod tests {
         let at = |name: &str| folder.path().join(name);
         std::fs::write(at("precious"), "precious").expect("written");
         std::fs::create_dir(at("elsewhere")).expect("a folder");
-        for (name, target) in
-            [("a", "precious"), ("a.part", "precious"), ("b.part", "elsewhere"), (".lock", "precious")]
-        {
+        for (name, target) in [
+            ("a", "precious"),
+            (".a.fieldrig.part", "precious"),
+            (".b.fieldrig.part", "elsewhere"),
+            (".lock", "precious"),
+        ] {
             symlink(at(target), at(name)).expect("a link");
         }
         replace(&at("a"), text("new")).expect("the links are replaced");
@@ -340,14 +359,95 @@ mod tests {
     #[test]
     fn only_leftovers_are_removed() {
         let folder = tempfile::tempdir().expect("a folder");
-        let (path, part) = (folder.path().join("a.ply"), folder.path().join("a.ply.part"));
+        let path = folder.path().join("a.ply");
+        let part = partial::path_of(&path);
         std::fs::create_dir(&part).expect("a folder");
         std::fs::write(part.join("notes.txt"), "of the user").expect("written");
         let refused = replace(&path, text("new")).expect_err("the folder may not be removed").to_string();
-        assert!(refused.contains("a.ply.part is a folder with other files"), "{refused}");
+        assert!(refused.contains(".a.ply.fieldrig.part is a folder with other files"), "{refused}");
         std::fs::rename(part.join("notes.txt"), part.join("a.ply")).expect("renamed");
         replace(&path, text("new")).expect("the folder is a leftover");
         assert_eq!(names(folder.path()), ["a.ply"]);
+    }
+
+    #[test]
+    fn files_that_a_user_calls_part_are_kept() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let at = |name: &str| folder.path().join(name);
+        std::fs::write(at("a.part"), "download").expect("written");
+        std::fs::create_dir(at("b.part")).expect("a folder");
+        std::fs::write(at(".c.part"), "download").expect("written");
+        replace(&at("a"), text("new")).expect("written");
+        create_from(&at("b"), |inside| std::fs::write(inside, "new")).expect("written");
+        create(&at("c"), text("new")).expect("written");
+        create_folder(&at("d"), &[], |inside| std::fs::create_dir(inside)).expect("created");
+        assert_eq!(names(folder.path()), [".c.part", "a", "a.part", "b", "b.part", "c", "d"]);
+        for name in ["a.part", ".c.part"] {
+            assert_eq!(std::fs::read_to_string(at(name)).expect("text"), "download");
+        }
+    }
+
+    /// Writes a folder with the entries `images` and `list`.
+    fn dataset(inside: &Path) -> std::io::Result<()> {
+        std::fs::create_dir_all(inside.join("images"))?;
+        std::fs::write(inside.join("images/0.png"), "new")?;
+        std::fs::write(inside.join("list"), "new")
+    }
+
+    const ENTRIES: [&str; 3] = ["images", "masks", "list"];
+
+    #[test]
+    fn folder_appears_when_it_is_complete() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let scan = folder.path().join("scan");
+        let unfinished = partial::path_of(&scan);
+        // What a killed program leaves behind.
+        dataset(&unfinished.join("scan")).expect("space");
+        create_folder(&scan, &ENTRIES, |inside| {
+            dataset(inside)?;
+            assert!(!scan.exists() && inside.starts_with(&unfinished));
+            let refused = create_folder(&scan, &ENTRIES, dataset).expect_err("it is being written");
+            assert_eq!(refused.to_string(), "another program is writing it");
+            Ok::<_, Error>(())
+        })
+        .expect("the leftover is replaced");
+        assert_eq!(
+            (names(&scan), names(folder.path())),
+            (vec!["images".to_owned(), "list".to_owned()], vec!["scan".to_owned()])
+        );
+        std::fs::remove_dir_all(&scan).expect("it exists");
+        let failed = create_folder(&scan, &ENTRIES, |inside| {
+            dataset(inside)?;
+            Err::<(), Error>(ErrorKind::StorageFull.into())
+        });
+        assert_eq!(failed.expect_err("the disk is full").kind(), ErrorKind::StorageFull);
+        assert!(names(folder.path()).is_empty(), "an incomplete folder is removed");
+        symlink(folder.path().join("absent"), &scan).expect("a link");
+        let refused = create_folder(&scan, &ENTRIES, dataset).expect_err("a link");
+        assert_eq!(refused.kind(), ErrorKind::AlreadyExists);
+        assert_eq!(names(folder.path()), ["scan"]);
+    }
+
+    #[test]
+    fn entries_appear_in_an_existing_folder_when_they_are_complete() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let at = |name: &str| folder.path().join(name);
+        std::fs::write(at("contents"), "of the user").expect("written");
+        // What a killed program leaves behind.
+        dataset(&partial::path_of(&at("contents")).join("contents")).expect("space");
+        create_folder(folder.path(), &ENTRIES, |inside| {
+            dataset(inside)?;
+            assert!(!at("images").exists() && !at("list").exists());
+            Ok::<_, Error>(())
+        })
+        .expect("the leftover is replaced");
+        assert_eq!(names(folder.path()), ["contents", "images", "list"]);
+        assert_eq!(names(&at("images")), ["0.png"]);
+        std::fs::remove_dir_all(at("images")).expect("it exists");
+        let refused = create_folder(folder.path(), &ENTRIES, dataset).expect_err("the list exists");
+        assert_eq!(refused.kind(), ErrorKind::AlreadyExists);
+        assert_eq!(names(folder.path()), ["contents", "list"], "images are removed again");
+        assert_eq!(std::fs::read_to_string(at("contents")).expect("text"), "of the user");
     }
 
     #[test]

@@ -1,13 +1,17 @@
-//! Fuzz target for model files: splats in `.ply` and `.spz`, and training checkpoints. The crate `trainer` is not
-//! linked, to keep the build fast.
+//! Fuzz target for model files: splats in `.ply`, `.spz` and `.splat`, and training checkpoints. The crate `trainer` is
+//! not linked, to keep the build fast.
 //!
 //! The first byte selects the format of the other bytes: a complete `.ply`, the uncompressed contents of a `.spz`, a
-//! complete `.spz`, or a checkpoint without its checksum.
+//! complete `.spz`, a checkpoint without its checksum, or a complete `.splat`.
 #![no_main]
 #![allow(dead_code, reason = "only reading is tested here")]
 
+#[path = "../../trainer/src/splat/antimatter15.rs"]
+mod antimatter15;
 #[path = "../../trainer/src/checkpoint.rs"]
 mod checkpoint;
+#[path = "../../trainer/src/initial_points.rs"]
+mod initial_points;
 #[path = "../../trainer/src/splat/ply/mod.rs"]
 mod ply;
 #[path = "../../trainer/src/splat/spz/mod.rs"]
@@ -18,6 +22,7 @@ mod splat {
 #[path = "../../trainer/src/splat/arrays.rs"]
 pub mod arrays;
 
+pub use initial_points::InitialPoints;
 use sha2::Digest;
 use std::io::Write;
 use std::path::PathBuf;
@@ -42,14 +47,22 @@ fn file(bytes: &[u8]) -> PathBuf {
 
 libfuzzer_sys::fuzz_target!(|bytes: &[u8]| {
     let Some((kind, bytes)) = bytes.split_first() else { return };
-    let splats = match kind % 4 {
-        0 => ply::read(&file(bytes)),
+    let splats = match kind % 5 {
+        0 => {
+            let path = file(bytes);
+            if let Ok((points, _)) = ply::read_points(&path) {
+                assert!(points.points_in_world_m.as_flattened().iter().all(|coordinate| coordinate.is_finite()));
+                assert!([0, points.points_in_world_m.len()].contains(&points.colors_srgb.len()));
+            }
+            ply::read(&path)
+        }
         1 => {
             let mut gzip = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::fast());
             gzip.write_all(bytes).expect("memory");
             spz::read(&file(&gzip.finish().expect("memory")))
         }
         2 => spz::read(&file(bytes)),
+        4 => antimatter15::read(&file(bytes)),
         _ => {
             let sum = sha2::Sha256::digest(bytes);
             if let Ok(checkpoint) = checkpoint::Checkpoint::read(&file(&[bytes, &sum[..]].concat())) {

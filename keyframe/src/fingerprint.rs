@@ -1,7 +1,7 @@
 //! Fingerprint of the keyframe data that affect a model.
 
 use crate::{DepthMap, Keyframe};
-use kinematics::Twist;
+use kinematics::{Transform, Twist, transform};
 
 /// Fingerprint of pixels, depth, intrinsics, pose, velocity and joint twists, without the split and ground truth.
 #[must_use]
@@ -55,9 +55,8 @@ impl Hash {
         twist.linear_m_s.iter().chain(twist.angular_rad_s.iter()).for_each(|number| self.number(*number));
     }
 
-    fn pose(&mut self, pose: &kinematics::Transform) {
-        let numbers = pose.translation.vector.iter().chain(pose.rotation.coords.iter());
-        numbers.for_each(|number| self.number(*number));
+    fn pose(&mut self, pose: &Transform) {
+        transform::to_xyz_xyzw(pose).into_iter().for_each(|number| self.number(number));
     }
 }
 
@@ -65,7 +64,7 @@ impl Hash {
 mod tests {
     use super::{fingerprint as of, *};
     use crate::Split;
-    use kinematics::{Stamp, Transform};
+    use kinematics::Stamp;
 
     fn keyframe() -> Keyframe {
         let depth = DepthMap {

@@ -16,7 +16,8 @@ pub enum Error {
     },
     /// The upper left 3x3 block is not a rotation: it is scaled, sheared or mirrored.
     #[error(
-        "transform: not rigid: its axes deviate from unit length or right angles by {off:.2e} (at most {allowed:.0e}), and its determinant is {determinant:.4}"
+        "transform: not rigid: its axes deviate from unit length or right angles by {off:.2e} (at most {allowed:.0e}), and its determinant is {determinant:.4}; {}",
+        rotation_advice(*.off, *.determinant)
     )]
     NotRigid {
         /// Largest element of `|RᵀR - 1|`.
@@ -183,6 +184,20 @@ pub enum Error {
         /// Its position or velocity.
         value: f64,
     },
+}
+
+/// What to change in a matrix whose 3x3 block is not a rotation.
+///
+/// * `off`: largest element of `|RᵀR - 1|`.
+fn rotation_advice(off: f64, determinant: f64) -> &'static str {
+    const MAX_ROUNDING: f64 = 0.2; // Matrices with one decimal deviate from a rotation by up to this.
+    if determinant < 0.0 {
+        "it is mirrored: check the sign of each axis"
+    } else if off > MAX_ROUNDING {
+        "expected a rotation without scale and shear"
+    } else {
+        "if the numbers were rounded, write at least four decimals"
+    }
 }
 
 fn above(ancestors: &[String]) -> String {

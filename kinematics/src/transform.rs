@@ -1,7 +1,7 @@
 //! Rigid motions and velocities.
 
 use crate::Error;
-use nalgebra::{Isometry3, Matrix3, Rotation3, Translation3, UnitQuaternion, Vector3};
+use nalgebra::{Isometry3, Matrix3, Quaternion, Rotation3, Translation3, UnitQuaternion, Vector3};
 
 /// A rigid motion, in meters. `a_from_b` maps coordinates in frame b to coordinates in frame a.
 pub type Transform = Isometry3<f64>;
@@ -87,6 +87,20 @@ pub fn to_rows(transform: &Transform) -> [f64; 16] {
     std::array::from_fn(|at| matrix[(at / 4, at % 4)])
 }
 
+/// The seven numbers of a pose in files: the position x, y, z in meters, then the quaternion x, y, z, w.
+pub fn to_xyz_xyzw(transform: &Transform) -> [f64; 7] {
+    let [x, y, z] = transform.translation.vector.into();
+    let [i, j, k, w] = transform.rotation.coords.into();
+    [x, y, z, i, j, k, w]
+}
+
+/// The bit-exact inverse of [`to_xyz_xyzw`].
+///
+/// The quaternion must have unit length: it is not normalized again, because that would change its last bits.
+pub fn from_xyz_xyzw([x, y, z, i, j, k, w]: [f64; 7]) -> Transform {
+    Transform::from_parts(Translation3::new(x, y, z), UnitQuaternion::new_unchecked(Quaternion::new(w, i, j, k)))
+}
+
 /// Smaller motions of a camera are noticeable neither in a picture nor in a map of the scene.
 const NOTICEABLE_M: f64 = 5e-4;
 const NOTICEABLE_RAD: f64 = 5e-4;
@@ -100,7 +114,7 @@ pub fn is_noticeable(motion: &Transform) -> bool {
 
 /// Whether all elements of a pose are finite.
 pub fn is_finite(transform: &Transform) -> bool {
-    transform.translation.vector.iter().chain(transform.rotation.coords.iter()).all(|number| number.is_finite())
+    to_xyz_xyzw(transform).iter().all(|number| number.is_finite())
 }
 
 /// Interpolates from `a` (`frac` 0) to `b` (`frac` 1): the translation linearly, the rotation at a constant rate
@@ -205,6 +219,23 @@ mod tests {
     }
 
     #[test]
+    fn seven_numbers_are_a_pose_bit_for_bit() {
+        let rotation = UnitQuaternion::new_unchecked(Quaternion::new(0.5, -0.5, 0.5, 0.5 + 1e-9));
+        let a = Transform::from_parts(Translation3::new(0.1 + 0.2, -0.0, 5e-324), rotation);
+        let numbers = to_xyz_xyzw(&a);
+        let expected = [0.1 + 0.2, -0.0, 5e-324, -0.5, 0.5, 0.5 + 1e-9, 0.5];
+        assert_eq!(numbers.map(f64::to_bits), expected.map(f64::to_bits), "x y z, then the quaternion with w last");
+        let back = from_xyz_xyzw(numbers);
+        assert_eq!(to_xyz_xyzw(&back).map(f64::to_bits), expected.map(f64::to_bits), "not normalized");
+        assert!(is_finite(&back));
+        for ix in 0..7 {
+            let mut broken = numbers;
+            broken[ix] = f64::NAN;
+            assert!(!is_finite(&from_xyz_xyzw(broken)), "{ix}");
+        }
+    }
+
+    #[test]
     fn rounded_rotations_are_orthonormalized() {
         let rows = to_rows(&pose(0.7, [0.3, -1.2, 2.0])).map(|value| (value * 1e4).round() / 1e4);
         let read = from_rows(&rows).unwrap();
@@ -225,16 +256,22 @@ mod tests {
         assert!(matches!(with(3, f64::INFINITY), Err(Error::TransformNotFinite { row: 0, column: 3, .. })));
         assert!(matches!(with(12, 0.1), Err(Error::LastRow { .. })));
         assert!(matches!(with(15, 0.0), Err(Error::LastRow { .. })));
-        let mut scaled = rows;
+        let scaled = |factor: f64| {
+            let mut scaled = rows;
+            (0..11).filter(|at| at % 4 < 3).for_each(|at| scaled[at] *= factor);
+            scaled
+        };
         let mut mirrored = rows;
-        for row in 0..3 {
-            for column in 0..3 {
-                scaled[4 * row + column] *= 1.001;
-            }
-            mirrored[4 * row] *= -1.0;
+        (0..3).for_each(|row| mirrored[4 * row] *= -1.0);
+        let refused = [
+            (scaled(1.001), "write at least four decimals"),
+            (scaled(2.0), "without scale and shear"),
+            (mirrored, "check the sign of each axis"),
+        ];
+        for (rows, advice) in refused {
+            let error = from_rows(&rows).unwrap_err();
+            assert!(matches!(error, Error::NotRigid { .. }) && error.to_string().ends_with(advice), "{error}");
         }
-        assert!(matches!(from_rows(&scaled), Err(Error::NotRigid { .. })));
-        assert!(matches!(from_rows(&mirrored), Err(Error::NotRigid { .. })));
         assert!(matches!(from_rows(&[0.0; 16]), Err(Error::LastRow { .. })));
     }
 

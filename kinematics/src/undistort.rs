@@ -70,6 +70,18 @@ impl Undistortion {
         Ok(self.resample::<4>(rgba))
     }
 
+    /// Undistorts the rows of `[height, width, 4]` as [`Self::apply_rgba`] does, but one at a time, so that the undistorted
+    /// image need not be in memory.
+    ///
+    /// The returned function writes the row with the given index to `[width, 4]`.
+    pub fn rgba_rows(&self, rgba: &[u8]) -> Result<impl Fn(usize, &mut [u8]), Error> {
+        self.check_len(rgba.len(), 4)?;
+        let width = self.size_px[0] as usize;
+        Ok(move |row: usize, undistorted: &mut [u8]| {
+            self.resample_to::<4>(rgba, &self.taps[row * width..(row + 1) * width], undistorted);
+        })
+    }
+
     /// Undistorts `[height, width]` depth along the camera's z axis. Lens distortion moves depth values but does not
     /// change them. Each output pixel takes the nearest source pixel, because averaging across an edge gives a depth at
     /// which there is no surface. Pixels whose source lies outside the image are 0.
@@ -88,10 +100,17 @@ impl Undistortion {
     }
 
     fn resample<const CHANNELS: usize>(&self, source: &[u8]) -> Vec<u8> {
-        let [step_right, step_down] = self.steps().map(|step| step * CHANNELS);
         let mut rgba = vec![0; self.taps.len() * 4];
-        for (tap, out) in self.taps.iter().zip(rgba.as_chunks_mut::<4>().0) {
+        self.resample_to::<CHANNELS>(source, &self.taps, &mut rgba);
+        rgba
+    }
+
+    /// Samples the source for some output pixels.
+    fn resample_to<const CHANNELS: usize>(&self, source: &[u8], taps: &[Tap], rgba: &mut [u8]) {
+        let [step_right, step_down] = self.steps().map(|step| step * CHANNELS);
+        for (tap, out) in taps.iter().zip(rgba.as_chunks_mut::<4>().0) {
             if tap.upper_left == u32::MAX {
+                *out = [0; 4];
                 continue;
             }
             let (right, lower) = (u32::from(tap.right), u32::from(tap.lower));
@@ -108,7 +127,6 @@ impl Undistortion {
                 out[channel] = round_share(sum);
             }
         }
-        rgba
     }
 
     /// Index offsets of the right and the lower neighbor in the source; 0 in an image of one column or row.
@@ -242,6 +260,21 @@ mod tests {
                 assert!(off < 0.65, "pixel {at} channel {channel}: off by {off}"); // 0.5 rounding, 2 * 255 / 4096 shares.
             }
         }
+    }
+
+    #[test]
+    fn rows_equal_those_of_the_whole_image() {
+        let map = Undistortion::new(&camera([33, 21], CUSHION));
+        assert!(map.n_outside() > 0);
+        let rgba = noise(33 * 21 * 4);
+        let whole = map.apply_rgba(&rgba).unwrap();
+        let write_row = map.rgba_rows(&rgba).unwrap();
+        let mut row = vec![7; 33 * 4]; // Also pixels outside the source must be written.
+        for (ix, expected) in whole.chunks(33 * 4).enumerate().rev() {
+            write_row(ix, &mut row);
+            assert_eq!(row, expected, "row {ix}");
+        }
+        assert!(map.rgba_rows(&rgba[1..]).is_err());
     }
 
     #[test]

@@ -3,7 +3,7 @@
 use crate::Error;
 use crate::error::Context;
 use keyframe::ensure;
-use kinematics::{Transform, transform};
+use kinematics::{Transform, shortened, transform};
 use serde::Deserialize;
 use serde_json::Value;
 use std::collections::{BTreeMap, BTreeSet};
@@ -97,10 +97,10 @@ impl PathFile {
         if unknown.is_empty() {
             return Vec::new();
         }
-        let named: Vec<String> = unknown.iter().take(MAX_NAMED).map(|key| format!("{key:?}")).collect();
-        let more = if unknown.len() > MAX_NAMED { ", ..." } else { "" };
+        let quoted: Vec<String> = unknown.iter().map(|key| format!("{key:?}")).collect();
+        let named = shortened(&quoted, MAX_NAMED, ", ");
         let advice = if unknown.contains("crop") { "; for \"crop\", use --crop" } else { "" };
-        vec![format!("unknown keys are not used: {}{more}{advice}", named.join(", "))]
+        vec![format!("unknown keys are not used: {named}{advice}")]
     }
 }
 
@@ -213,6 +213,12 @@ mod tests {
             changed["camera_path"][0][key] = 1.into();
             assert_eq!(parse(&changed).expect("a path").notes, [note]);
         }
+        let mut many = plain.clone();
+        for key in ["a", "b", "c", "d", "e", "f", "g"] {
+            many[key] = 1.into();
+        }
+        let note = r#"unknown keys are not used: "a", "b", "c", "d", "e" and 2 more"#;
+        assert_eq!(parse(&many).expect("a path").notes, [note]);
         let mut wide = plain.clone();
         wide["default_fov"] = 90.into();
         assert_eq!(parse(&wide).expect("a path").cameras[0].fov_y_rad, Some(std::f64::consts::FRAC_PI_2));

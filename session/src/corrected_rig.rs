@@ -1,13 +1,15 @@
 //! Writes a rig file with the calibration corrections that were estimated.
 
+use crate::Error;
 use crate::error::Context;
-use crate::{Error, run_folder};
 use calibration::{Alignment, CameraCorrection, Estimate};
 use capture::config::{Base, Camera, Parent, Rig, TimeOffset};
 use keyframe::listed;
 use kinematics::{Chain, Intrinsics, Stamp, Transform};
 use nalgebra::{DMatrix, Translation3, UnitQuaternion, Vector3};
 use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::{ErrorKind, Write};
 use std::path::{Path, PathBuf};
 
 /// Values of `source` in a corrected time offset.
@@ -178,24 +180,51 @@ fn other_robot(rig: &Rig, file: &Path) -> Option<PathBuf> {
 }
 
 /// Writes a rig file atomically, and the robot's URDF next to it. A file that it replaces is kept with the extension
-/// `.old`, or `.old2` and so on if that exists. Does not overwrite the URDF of another robot.
+/// `.old`, or `.old2` and so on if that exists. Does not overwrite the URDF of another robot. Of two programs that write the
+/// same file at the same time, the second gets an error.
 pub fn write(rig: &Rig, file: &Path) -> crate::Result<()> {
     check_target_file(rig, file)?;
-    let urdf = file.with_file_name(drivers::recording::URDF_FILE);
-    let in_file = || format!("cannot write {}", file.display());
-    if !urdf.exists() {
-        files::write(&urdf, &rig.arm.urdf_text).with_context(in_file)?;
-    }
-    if file.exists() {
-        let copy = |backup: &mut std::fs::File| std::io::copy(&mut files::open(file)?, backup).map(drop);
-        files::create(&unused_backup(file), copy).with_context(in_file)?;
-    }
     let linked = std::fs::read_link(file);
-    run_folder::write_atomic(file, &rig.to_toml()).with_context(in_file)?;
+    // The previous file is copied while no other program can write it, so that the copy has the latest contents.
+    let written = files::replace(file, |unfinished| {
+        write_urdf(rig, file)?;
+        back_up(file)?;
+        unfinished.write_all(rig.to_toml().as_bytes())
+    });
+    written.with_context(|| format!("cannot write {}", file.display()))?;
     if let Ok(target) = linked {
         log::warn!("{} was a symbolic link: it is a file now, and {} is unchanged", file.display(), target.display());
     }
     Ok(())
+}
+
+/// Writes the robot's URDF next to a rig file, unless it is there.
+fn write_urdf(rig: &Rig, file: &Path) -> std::io::Result<()> {
+    let urdf = file.with_file_name(drivers::recording::URDF_FILE);
+    let error = match files::create(&urdf, |out| out.write_all(rig.arm.urdf_text.as_bytes())) {
+        Ok(()) => return Ok(()),
+        Err(error) => error,
+    };
+    let problem = match error.kind() {
+        ErrorKind::AlreadyExists if urdf.exists() => match other_robot(rig, file) {
+            // Another program has written it since it was checked.
+            Some(_) => "it is that of another robot".to_owned(),
+            None => return Ok(()),
+        },
+        _ => error.to_string(),
+    };
+    Err(std::io::Error::new(error.kind(), format!("{}: {problem}", urdf.display())))
+}
+
+/// Copies a file, if it exists, to an unused name.
+fn back_up(file: &Path) -> std::io::Result<()> {
+    if !file.exists() {
+        return Ok(());
+    }
+    let backup = unused_backup(file);
+    let copy = |backup: &mut File| std::io::copy(&mut files::open(file)?, backup).map(drop);
+    files::create(&backup, copy)
+        .map_err(|error| std::io::Error::new(error.kind(), format!("cannot keep it as {}: {error}", backup.display())))
 }
 
 /// Path of a backup that does not exist yet.
@@ -206,7 +235,9 @@ fn unused_backup(file: &Path) -> PathBuf {
         PathBuf::from(path)
     };
     let numbered = (2..).map(|number: u32| with(format!(".old{number}")));
-    std::iter::once(with(".old".to_owned())).chain(numbered).find(|path| !path.exists()).expect("an unused number")
+    let mut names = std::iter::once(with(".old".to_owned())).chain(numbered);
+    // A broken symbolic link takes a name, too.
+    names.find(|path| path.symlink_metadata().is_err()).expect("an unused number")
 }
 
 /// Applies a correction. `estimates` contain the standard deviation of the time offset, if it is known; `source` names
@@ -333,6 +364,60 @@ mod tests {
             check_target_file(&calibrated_rig, &file).unwrap_err().to_string().contains("another robot"),
             "the check before training rejects it, too"
         );
+    }
+
+    /// As when several programs write their results into one rig file.
+    #[test]
+    fn no_result_of_simultaneous_writers_disappears() {
+        const N_WRITERS: u32 = 4;
+        const N_FILES: u32 = 10;
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("rig.toml");
+        let write_often = |writer: u32| {
+            let mut rig = bundled_rig();
+            let mut texts = Vec::new();
+            for ix in 0..N_FILES {
+                rig.cameras[0].intrinsics.focal_px[0] = 600.0 + f64::from(N_FILES * writer + ix);
+                match write(&rig, &file) {
+                    Ok(()) => texts.push(rig.to_toml()),
+                    Err(error) => {
+                        let message = format!("{error:#}");
+                        assert!(message.ends_with("rig.toml: another program is writing it"), "{message}");
+                    }
+                }
+            }
+            texts
+        };
+        let mut written = std::thread::scope(|scope| {
+            let write_often = &write_often;
+            let writers: Vec<_> = (0..N_WRITERS).map(|writer| scope.spawn(move || write_often(writer))).collect();
+            writers.into_iter().flat_map(|writer| writer.join().unwrap()).collect::<Vec<String>>()
+        });
+        let is_rig =
+            |path: &PathBuf| path.file_name().is_some_and(|name| name.to_string_lossy().starts_with("rig.toml"));
+        let paths = std::fs::read_dir(folder.path()).unwrap().map(|entry| entry.unwrap().path()).filter(is_rig);
+        let mut found: Vec<String> = paths.map(|path| std::fs::read_to_string(path).unwrap()).collect();
+        written.sort();
+        found.sort();
+        assert!(!written.is_empty() && found == written, "{} files of {} writes", found.len(), written.len());
+        assert!(std::fs::read_dir(folder.path()).unwrap().count() == found.len() + 1, "these and the URDF");
+    }
+
+    #[test]
+    fn urdf_that_another_program_writes_is_kept() {
+        let folder = tempfile::tempdir().unwrap();
+        let (rig, file) = (bundled_rig(), folder.path().join("rig.toml"));
+        let urdf = folder.path().join(drivers::recording::URDF_FILE);
+        write_urdf(&rig, &file).unwrap();
+        write_urdf(&rig, &file).expect("it is that of the same robot");
+        std::fs::write(&urdf, "<robot/>").unwrap();
+        let error = write_urdf(&rig, &file).unwrap_err().to_string();
+        assert!(error.ends_with("robot.urdf: it is that of another robot"), "{error}");
+        assert_eq!(std::fs::read_to_string(&urdf).unwrap(), "<robot/>");
+        std::fs::remove_file(&urdf).unwrap();
+        std::os::unix::fs::symlink(folder.path().join("absent"), &urdf).unwrap();
+        let error = write_urdf(&rig, &file).unwrap_err().to_string();
+        assert!(error.ends_with("robot.urdf: it exists already"), "{error}");
     }
 
     #[test]

@@ -4,7 +4,7 @@ use crate::Error;
 use crate::depth_from::{DepthSource, RenderedDepth};
 use crate::methods::methods_of;
 use crate::read_progress::{OnReadProgress, ReadProgress};
-use crate::run_folder::is_recording;
+use crate::run_folder::{hex, is_recording};
 use crate::training_options::{AvailableData, MIN_IMAGES_PER_CAMERA};
 use capture::config::{Override, Rig};
 use capture::open::{self, Opened};
@@ -12,12 +12,14 @@ use capture::{Join, JoinEvent, SampleUse, StationReport, Stations, dataset};
 use drivers::Sample;
 use keyframe::ensure;
 use keyframe::{Holdout, Keyframe, KeyframeList, Split, counted};
+use sha2::{Digest, Sha256};
 use std::collections::{BTreeMap, HashSet};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
-use trainer::ModelKind;
 use trainer::gpu::Gpu;
+use trainer::splat::ply;
+use trainer::{InitialPoints, ModelKind};
 
 /// Which images are read, and how they are scaled and split.
 #[derive(Clone, Debug, Default)]
@@ -104,6 +106,8 @@ pub struct Data {
     pub keyframes: Vec<Arc<Keyframe>>,
     /// Names of the images, in the same order.
     pub names: Vec<String>,
+    /// PLY file of points from which models without depth start; `None` if the data names none.
+    pub points_path: Option<PathBuf>,
     /// The rig of the recording; `None` for a folder.
     pub rig: Option<Rig>,
     /// Whether the stamps are times rather than image indices.
@@ -263,6 +267,33 @@ impl Data {
         self.keyframes.iter().any(|keyframe| keyframe.depth.is_some())
     }
 
+    /// Reads the points from which models without depth start. `None` if the data names none, if they cannot be read, or if
+    /// a training or validation image has depth; the reason is logged.
+    pub fn initial_points(&self) -> Option<Arc<InitialPoints>> {
+        let path = self.points_path.as_deref()?;
+        let shown = path.display();
+        let is_learned_with_depth =
+            |keyframe: &Arc<Keyframe>| keyframe.split != Split::Test && keyframe.depth.is_some();
+        if self.keyframes.iter().any(is_learned_with_depth) {
+            log::warn!("{shown}: these points are not used, because images have depth");
+            return None;
+        }
+        match ply::read_points(path).map_err(Error::from) {
+            Ok((points, notes)) => {
+                for note in notes {
+                    log::warn!("{shown}: {note}");
+                }
+                let n_points = counted(points.points_in_world_m.len() as u64, "point");
+                log::info!("{shown}: splats start at {n_points}");
+                Some(Arc::new(points))
+            }
+            Err(error) => {
+                log::warn!("training starts without the points of the dataset: {error:#}");
+                None
+            }
+        }
+    }
+
     /// Renders depth for images without depth from a model.
     pub fn render_depth(
         &mut self,
@@ -293,6 +324,7 @@ impl Data {
         let mut data = Self {
             keyframes: loaded.keyframes,
             names: loaded.names,
+            points_path: folder.points_path.clone(),
             rig: None,
             has_times: folder.has_times(),
             data_losses: loaded.data_losses,
@@ -366,6 +398,7 @@ impl Data {
         Ok(Self {
             keyframes,
             names,
+            points_path: None,
             rig: Some(rig),
             has_times: true,
             data_losses,
@@ -413,6 +446,16 @@ impl Data {
     }
 }
 
+/// SHA-256 of positions and colors, which identifies points in decision logs.
+pub fn points_sha256(points: &InitialPoints) -> String {
+    let mut hash = Sha256::new();
+    for coordinate in points.points_in_world_m.as_flattened() {
+        hash.update(coordinate.to_le_bytes());
+    }
+    hash.update(points.colors_srgb.as_flattened());
+    hex(&hash.finalize())
+}
+
 /// Returns an error if the path does not exist.
 pub fn expect(path: &Path) -> crate::Result<()> {
     ensure!(path.exists(), "{} does not exist", path.display());
@@ -427,6 +470,9 @@ fn name(keyframe: &Keyframe) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::ignore_progress;
+    use nalgebra::Point3;
+    use serde_json::{Value, json};
 
     #[test]
     fn missing_flags_are_restored() {
@@ -442,5 +488,52 @@ mod tests {
         let other = again(&DataOptions { scale: Some(0.5), ..none.clone() }).expect_err("another").to_string();
         assert_eq!(other, "--scale 0.5: the checkpoint was trained with --scale 0.25");
         assert!(again(&DataOptions { holdout: Some("2".into()), ..none }).is_err());
+    }
+
+    #[test]
+    fn initial_points_are_read_unless_there_is_depth_or_they_are_damaged() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let at = |name: &str| folder.path().join(name);
+        let frame = |name: &str| {
+            image::RgbImage::from_pixel(64, 48, image::Rgb([10, 20, 30])).save(at(name)).expect("saved");
+            let rows = [[1, 0, 0, 5], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]];
+            json!({ "file_path": name, "transform_matrix": rows })
+        };
+        let frames = [frame("test.png"), frame("train.png")];
+        let mut document = json!({ "fl_x": 60.0, "frames": frames, "ply_file_path": "points.ply" });
+        let load = |document: &Value| {
+            std::fs::write(at("transforms.json"), document.to_string()).expect("written");
+            let data = Data::load(folder.path(), &DataOptions::default(), Purpose::Training, &[], &ignore_progress);
+            data.expect("points do not affect the images")
+        };
+        let coordinates = "property float x\nproperty float y\nproperty float z\n";
+        let channels = "property uchar red\nproperty uchar green\nproperty uchar blue\n";
+        let header = format!("ply\nformat ascii 1.0\nelement vertex 2\n{coordinates}{channels}end_header\n");
+        let write = |rows: &str| std::fs::write(at("points.ply"), format!("{header}{rows}")).expect("written");
+
+        write("5.5 1 -3 255 0 0\nnan 0 0 1 2 3\n");
+        let data = load(&document);
+        let points = data.initial_points().expect("one point is usable");
+        assert_eq!(points.points_in_world_m, [[5.5, 1.0, -3.0]]);
+        assert_eq!(points.colors_srgb, [[255, 0, 0]]);
+        // The point is in the frame of the poses: to the right of the camera, above its axis, and in front of it.
+        let in_camera = data.keyframes[0].world_from_camera.inverse() * Point3::new(5.5, 1.0, -3.0);
+        assert!((in_camera - Point3::new(0.5, -1.0, 3.0)).norm() < 1e-9, "{in_camera}");
+        let first = points_sha256(&points);
+        write("5.5 1 -3 255 0 1\nnan 0 0 1 2 3\n");
+        let second = points_sha256(&load(&document).initial_points().expect("another color"));
+        assert!(first.len() == 64 && first != second, "{first} {second}");
+
+        let depth = image::ImageBuffer::<image::Luma<u16>, _>::from_pixel(64, 48, image::Luma([1000]));
+        depth.save(at("depth.png")).expect("saved");
+        document["frames"][0]["depth_file_path"] = "depth.png".into();
+        assert!(load(&document).initial_points().is_some(), "test images do not matter");
+        document["frames"][1]["depth_file_path"] = "depth.png".into();
+        assert!(load(&document).initial_points().is_none(), "depth has priority");
+        document["frames"][1]["depth_file_path"] = Value::Null;
+        write("5.5 1 -3 255 0 1\n");
+        assert!(load(&document).initial_points().is_none(), "truncated");
+        document["ply_file_path"] = "gone.ply".into();
+        assert!(load(&document).initial_points().is_none(), "missing");
     }
 }

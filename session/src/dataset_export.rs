@@ -2,7 +2,6 @@
 
 use crate::error::Context;
 use drivers::dataset::nerfstudio;
-use files::partial::Partial;
 use image::ExtendedColorType;
 use keyframe::{DepthMap, Keyframe, Split};
 use keyframe::{bail, ensure};
@@ -22,7 +21,7 @@ const TEST_LIST: &str = "test.txt";
 const LISTS: [(&str, Split); 3] =
     [("train_filenames", Split::Train), ("val_filenames", Split::Validation), ("test_filenames", Split::Test)];
 
-/// The entries of a dataset folder.
+/// The entries of a dataset folder. The last one identifies a dataset, so a folder that has it is complete.
 const ENTRIES: [&str; 5] = [IMAGES, MASKS, DEPTH, TEST_LIST, nerfstudio::FILE_NAME];
 const IMAGES: &str = "images";
 const MASKS: &str = "masks";
@@ -40,34 +39,39 @@ pub struct Written {
     pub n_depth_skipped: usize,
 }
 
-/// Writes a dataset to a folder that does not contain one yet. `transforms.json` is written last, so a folder that has
-/// it is complete.
+/// Writes a dataset to a folder that does not contain one yet. The folder is written under a temporary name, so it is
+/// complete or absent even if the program is killed. Into a folder that exists already, `transforms.json` is moved last.
 ///
 /// Depth is rounded to millimeters and limited to 65 m. Velocities, readout times and ground truth of simulators are
 /// not exported.
 pub fn write_nerfstudio(out: &Path, keyframes: impl Iterator<Item = Arc<Keyframe>>) -> crate::Result<Written> {
-    let transforms = out.join(nerfstudio::FILE_NAME);
     if let Some(existing) = ENTRIES.iter().map(|entry| out.join(entry)).find(|entry| entry.exists()) {
         bail!("{} already exists: give another folder", existing.display());
     }
     for entry in ENTRIES {
         files::check_no_link(&out.join(entry)).context("cannot export")?;
     }
-    let partial = Partial::folder(out, &ENTRIES);
+    let mut keyframes = keyframes.peekable();
+    ensure!(keyframes.peek().is_some(), "no keyframe to export");
+    let in_out = || format!("cannot write {}", out.display());
+    out.parent().map_or(Ok(()), std::fs::create_dir_all).with_context(in_out)?;
+    files::create_folder(out, &ENTRIES, |folder| write_dataset(folder, keyframes)).with_context(in_out)
+}
+
+/// Writes the files of a dataset. Errors name them relative to the folder, which has a temporary name.
+fn write_dataset(folder: &Path, keyframes: impl Iterator<Item = Arc<Keyframe>>) -> crate::Result<Written> {
     let mut written = Written::default();
     let (mut cameras, mut frames, mut splits) = (Vec::new(), Vec::new(), Vec::new());
     for keyframe in keyframes {
-        frames.push(write_frame(out, &keyframe, &mut written)?);
+        frames.push(write_frame(folder, &keyframe, &mut written)?);
         cameras.push(camera_keys(&keyframe));
         splits.push(keyframe.split);
     }
-    ensure!(!frames.is_empty(), "no keyframe to export");
-
     let names = |wanted_split: Split| {
         let of_split = frames.iter().zip(&splits).filter(move |(_, split)| **split == wanted_split);
         of_split.filter_map(|(frame, _)| frame["file_path"].as_str().map(str::to_owned)).collect::<Vec<_>>()
     };
-    write_text(&out.join(TEST_LIST), &(names(Split::Test).join("\n") + "\n"))?;
+    write_text(folder, TEST_LIST, &(names(Split::Test).join("\n") + "\n"))?;
     let mut document = Map::new();
     document.insert("camera_model".to_owned(), json!("PINHOLE"));
     document.insert("depth_unit_scale_factor".to_owned(), json!(METERS_PER_COUNT));
@@ -80,32 +84,32 @@ pub fn write_nerfstudio(out: &Path, keyframes: impl Iterator<Item = Arc<Keyframe
         frames.iter_mut().zip(&mut cameras).for_each(|(frame, camera)| frame.append(camera));
     }
     document.insert("frames".to_owned(), json!(frames));
-    write_text(&transforms, &serde_json::to_string_pretty(&document)?)?;
-    partial.keep();
+    write_text(folder, nerfstudio::FILE_NAME, &serde_json::to_string_pretty(&document)?)?;
     Ok(written)
 }
 
 /// Writes the images of one keyframe and returns its entry.
-fn write_frame(out: &Path, keyframe: &Keyframe, written: &mut Written) -> crate::Result<Map<String, Value>> {
+fn write_frame(folder: &Path, keyframe: &Keyframe, written: &mut Written) -> crate::Result<Map<String, Value>> {
     let name = format!("{}_{:020}.png", keyframe.camera, keyframe.stamp.0);
+    let [image, mask, depth_image] = [IMAGES, MASKS, DEPTH].map(|entry| format!("{entry}/{name}"));
     let mut frame = Map::new();
     let mut insert = |key: &str, value: Value| frame.insert(key.to_owned(), value);
-    insert("file_path", json!(format!("{IMAGES}/{name}")));
+    insert("file_path", json!(image));
     insert("transform_matrix", opengl_rows(&keyframe.world_from_camera));
 
     let pixels = keyframe.rgba_srgb.as_chunks::<4>().0;
     let rgb: Vec<u8> = pixels.iter().flat_map(|&[red, green, blue, _]| [red, green, blue]).collect();
-    write_png(&out.join(IMAGES).join(&name), keyframe.size_px, &rgb, ExtendedColorType::Rgb8)?;
+    write_png(folder, &image, keyframe.size_px, &rgb, ExtendedColorType::Rgb8)?;
     written.n_images += 1;
     if pixels.iter().any(|pixel| pixel[3] == 0) {
-        let mask: Vec<u8> = pixels.iter().map(|pixel| pixel[3]).collect();
-        write_png(&out.join(MASKS).join(&name), keyframe.size_px, &mask, ExtendedColorType::L8)?;
-        insert("mask_path", json!(format!("{MASKS}/{name}")));
+        let alpha: Vec<u8> = pixels.iter().map(|pixel| pixel[3]).collect();
+        write_png(folder, &mask, keyframe.size_px, &alpha, ExtendedColorType::L8)?;
+        insert("mask_path", json!(mask));
     }
     match &keyframe.depth {
         Some(depth) if has_lens_of(depth, keyframe) => {
-            write_png(&out.join(DEPTH).join(&name), depth.size_px, &depth_counts(depth), ExtendedColorType::L16)?;
-            insert("depth_file_path", json!(format!("{DEPTH}/{name}")));
+            write_png(folder, &depth_image, depth.size_px, &depth_counts(depth), ExtendedColorType::L16)?;
+            insert("depth_file_path", json!(depth_image));
             if depth.world_from_camera != keyframe.world_from_camera {
                 insert("depth_transform_matrix", opengl_rows(&depth.world_from_camera));
             }
@@ -154,16 +158,24 @@ fn depth_counts(depth: &DepthMap) -> Vec<u8> {
     depth.depth_m.iter().flat_map(|depth_m| count(depth_m).to_ne_bytes()).collect()
 }
 
-fn write_png(path: &Path, size_px: [u32; 2], bytes: &[u8], color: ExtendedColorType) -> crate::Result<()> {
+/// Writes pixels in the given format to a file with a relative path.
+fn write_png(
+    folder: &Path,
+    file: &str,
+    [width, height]: [u32; 2],
+    bytes: &[u8],
+    color: ExtendedColorType,
+) -> crate::Result<()> {
+    let path = folder.join(file);
     let write = || {
         path.parent().map_or(Ok(()), std::fs::create_dir_all)?;
-        image::save_buffer(path, bytes, size_px[0], size_px[1], color)
+        image::save_buffer(&path, bytes, width, height, color)
     };
-    write().with_context(|| format!("cannot write {}", path.display()))
+    write().context(file)
 }
 
-fn write_text(path: &Path, text: &str) -> crate::Result<()> {
-    files::write(path, text).with_context(|| format!("cannot write {}", path.display()))
+fn write_text(folder: &Path, file: &str, text: &str) -> crate::Result<()> {
+    files::write(&folder.join(file), text).context(file)
 }
 
 #[cfg(test)]
@@ -254,6 +266,26 @@ mod tests {
             .map(|image| image.intrinsics.size_px)
             .collect();
         assert_eq!(sizes, [[24, 32], [32, 24]]);
+    }
+
+    #[test]
+    fn export_appears_when_it_is_complete() {
+        let folder = tempfile::tempdir().unwrap();
+        let out = folder.path().join("scan");
+        // What a killed export leaves behind.
+        let leftover = files::partial::path_of(&out).join("scan").join(IMAGES);
+        std::fs::create_dir_all(&leftover).unwrap();
+        std::fs::write(leftover.join("old.png"), b"half of").unwrap();
+        let until_complete = |ix| {
+            assert!(!out.exists(), "the export can be killed before keyframe {ix}");
+            Arc::new(keyframe(ix))
+        };
+        write_nerfstudio(&out, (0..3).map(until_complete)).unwrap();
+        assert_eq!(std::fs::read_dir(out.join(IMAGES)).unwrap().count(), 3);
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1, "no temporary folder remains");
+        let error = write_nerfstudio(&out.join("transforms.json/new"), (0..3).map(|ix| Arc::new(keyframe(ix))));
+        let error = format!("{:#}", error.unwrap_err());
+        assert!(error.starts_with("cannot write ") && error.contains("transforms.json/new: "), "{error}");
     }
 
     #[test]

@@ -7,8 +7,8 @@
 use crate::Error;
 use crate::error::Context;
 use keyframe::{Keyframe, Split, split_from_name, split_name};
+use kinematics::transform::{from_xyz_xyzw, to_xyz_xyzw};
 use kinematics::{Stamp, Transform};
-use nalgebra::{Quaternion, Translation3, UnitQuaternion};
 use serde::{Deserialize, Serialize};
 use std::io::Write;
 use std::path::Path;
@@ -39,6 +39,10 @@ pub struct Settings {
     /// SHA-256 of the model from which missing depth was rendered; `None` if depth was not rendered.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub depth_from: Option<String>,
+    /// SHA-256 of the points of the dataset from which training starts, see [`points_sha256`](crate::points_sha256); `None`
+    /// if there are none, or if they are not used because of depth.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub points: Option<String>,
     /// Step of the checkpoint that training continued from; `None` for a new run.
     pub from_step: Option<u64>,
     /// Options of the model.
@@ -57,6 +61,8 @@ pub struct RunDescription<'a> {
     pub scale: f64,
     /// SHA-256 of the model from which depth was rendered.
     pub depth_from: Option<String>,
+    /// SHA-256 of the points from which training starts.
+    pub points: Option<String>,
     /// Step of the checkpoint that training continues from; `None` for a new run.
     pub from_step: Option<u64>,
     /// Options of the model.
@@ -74,6 +80,7 @@ impl Settings {
             adapter: description.adapter,
             scale: description.scale,
             depth_from: description.depth_from,
+            points: description.points,
             from_step: description.from_step,
             options: description.options,
         }
@@ -164,19 +171,20 @@ impl TryFrom<bool> for True {
 
 impl Pushed {
     fn of(keyframe: &Keyframe) -> Self {
+        let map_from_odom = keyframe.base.as_ref().map(|base| base.map_from_odom);
         Self {
             camera: keyframe.camera.to_string(),
             stamp_nanos: keyframe.stamp.0,
             split: split_name(keyframe.split).to_owned(),
             fingerprint: fingerprint_of(keyframe),
-            map_from_odom: keyframe.base.as_ref().map(|base| base.map_from_odom).filter(is_motion).map(numbers),
+            map_from_odom: map_from_odom.filter(is_motion).map(|motion| to_xyz_xyzw(&motion)),
         }
     }
 
     /// The keyframe as it was added: `reported` with the logged correction of its base pose applied.
     pub fn corrected(&self, reported: &Arc<Keyframe>) -> Arc<Keyframe> {
         match self.map_from_odom {
-            Some(numbers) => Arc::new(reported.with_base_correction(&motion(numbers))),
+            Some(numbers) => Arc::new(reported.with_base_correction(&from_xyz_xyzw(numbers))),
             None => reported.clone(),
         }
     }
@@ -194,17 +202,6 @@ impl Pushed {
 
 fn is_motion(transform: &Transform) -> bool {
     *transform != Transform::identity()
-}
-
-fn numbers(motion: Transform) -> [f64; 7] {
-    let [x, y, z] = motion.translation.vector.into();
-    let [i, j, k, w] = motion.rotation.coords.into();
-    [x, y, z, i, j, k, w]
-}
-
-/// The bit-exact inverse of [`numbers`].
-fn motion([x, y, z, i, j, k, w]: [f64; 7]) -> Transform {
-    Transform::from_parts(Translation3::new(x, y, z), UnitQuaternion::new_unchecked(Quaternion::new(w, i, j, k)))
 }
 
 fn fingerprint_of(keyframe: &Keyframe) -> String {
@@ -450,6 +447,7 @@ mod tests {
             adapter: "llvmpipe".to_owned(),
             scale: 0.5,
             depth_from: from_step.map(|_| "5ad1".to_owned()),
+            points: from_step.map(|_| "c0de".to_owned()),
             from_step,
             options: ModelOptions::<SplatOptions>::default()
                 .with(|options| {

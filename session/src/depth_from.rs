@@ -39,7 +39,7 @@ impl DepthSource {
         run_folder::expect_model(model).map_err(invalid)?;
         let sha256 = if model.is_file() {
             let bytes =
-                files::read(model, files::NO_LIMIT).with_context(|| format!("cannot read {}", model.display()))?;
+                files::read(model, files::Budget::PLAIN).with_context(|| format!("cannot read {}", model.display()))?;
             run_folder::hex(&Sha256::digest(bytes))
         } else {
             run_folder::checkpoint_sha256(model)?

@@ -31,7 +31,7 @@ impl KeptFolder {
 
     /// Watches a locked folder, after the first files were written into it.
     fn new(folder: &Path) -> Self {
-        let read = |name| Some((name, files::read(&folder.join(name), files::MAX_TEXT_BYTES).ok()?));
+        let read = |name| Some((name, files::read(&folder.join(name), files::Budget::TEXT).ok()?));
         Self {
             kept: Kept::open(folder).ok(),
             first_files: [RIG_FILE, URDF_FILE, KEYFRAME_LIST].into_iter().filter_map(read).collect(),

@@ -67,7 +67,7 @@ mod viewers;
 
 pub use checkpoints::{CheckpointOptions, Checkpoints, RunFlags, parse_period};
 pub use clock::Clock;
-pub use data::{Data, DataOptions, Purpose, expect};
+pub use data::{Data, DataOptions, Purpose, expect, points_sha256};
 pub use dataset_export::{Written, write_nerfstudio};
 pub use decisions::{DecisionLog, RunDescription, Settings};
 pub use error::{Context, Error, Result};

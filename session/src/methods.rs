@@ -36,10 +36,28 @@ pub fn kind_of(path: &Path) -> crate::Result<Option<ModelKind>> {
     Ok(ModelKind::of_saved(path)?)
 }
 
-/// Loads a saved model of any kind from its folder, or splats from a file.
+/// Loads a saved model of any kind from its folder, or splats from a file. An empty model causes a warning.
 pub fn load(gpu: Arc<Gpu>, model: &Path) -> crate::Result<LoadedModel> {
     expect_model(model)?;
-    Ok(trainer::load(gpu, model)?)
+    let loaded = trainer::load(gpu, model)?;
+    if let Some(note) = note_if_empty(model, &loaded) {
+        log::warn!("{note}");
+    }
+    Ok(loaded)
+}
+
+/// A note about a model that contains nothing to render; `None` for other models.
+///
+/// * `path`: path of the model.
+#[must_use]
+pub fn note_if_empty(path: &Path, model: &LoadedModel) -> Option<String> {
+    let is_empty = model.method.progress().primitives == 0;
+    is_empty.then(|| empty_note(path, model.kind))
+}
+
+fn empty_note(path: &Path, kind: ModelKind) -> String {
+    let primitives = kind.entry().primitives_label.to_lowercase();
+    format!("{} contains no {primitives}: its pictures show only the background", path.display())
 }
 
 /// The methods listed in a rig file.
@@ -87,6 +105,12 @@ mod tests {
             assert!(ModelKind::ALL.iter().any(|kind| kind.has_option(name)), "{name}");
         }
         assert!(!ModelKind::ALL.iter().any(|kind| kind.has_option("max-splats")));
+    }
+
+    #[test]
+    fn note_names_the_empty_model() {
+        let note = empty_note(Path::new("splats.ply"), ModelKind::default());
+        assert_eq!(note, "splats.ply contains no splats: its pictures show only the background");
     }
 
     #[test]

@@ -88,6 +88,21 @@ impl Replay {
         depth_from::check_same(&self.name(), self.decisions.settings.depth_from.as_deref(), sha256)
     }
 
+    /// Checks that training starts from the same points as the logged run, identified by their SHA-256.
+    pub fn check_points(&self, sha256: Option<&str>) -> Result<(), Error> {
+        let name = self.name();
+        match (self.decisions.settings.points.as_deref(), sha256) {
+            (log, here) if log == here => Ok(()),
+            (None, _) => Err(Error::InsufficientData(format!(
+                "{name} starts without points: remove ply_file_path from transforms.json"
+            ))),
+            (Some(log), here) => Err(Error::InsufficientData(format!(
+                "{name} starts from points with the SHA-256 {log}, but the data {}: restore the file of ply_file_path",
+                here.map_or_else(|| "has no points".to_owned(), |here| format!("has points with {here}"))
+            ))),
+        }
+    }
+
     /// Checks that training starts at the same step as the log. `from_step`: step of the checkpoint that training
     /// continues from.
     pub fn check_start(&self, from_step: Option<u64>) -> Result<(), Error> {

@@ -2,14 +2,11 @@
 
 use crate::error::Context;
 use capture::config::{ArmDriver, Rig};
+use files::Budget;
 use kinematics::shape::Geometry;
 use kinematics::urdf::Robot;
 use std::path::{Path, PathBuf};
 use viz::{MeshFormat, RobotDescription, RobotMesh};
-
-/// Maximum size of a mesh file, and of all mesh files of a robot, bytes. Larger ones are not drawn.
-const MAX_FILE_BYTES: u64 = 64 << 20;
-const MAX_TOTAL_BYTES: u64 = 256 << 20;
 
 /// The robot of a rig; `None` if the rig has neither an arm nor a moving base. Shapes that cannot be drawn cause only a
 /// warning.
@@ -31,7 +28,7 @@ pub fn description(rig: &Rig, rig_file: &Path) -> crate::Result<Option<RobotDesc
 /// Reads the mesh files of all visual shapes.
 fn meshes(robot: &Robot, urdf_folder: &Path) -> Vec<RobotMesh> {
     let mut meshes: Vec<RobotMesh> = Vec::new();
-    let mut n_bytes = 0;
+    let mut budget = Budget::MESHES;
     let shapes = robot.links().iter().flat_map(|link| robot.visuals(link));
     let files = shapes.filter_map(|shape| match &shape.geometry {
         Geometry::Mesh { file, .. } => Some(file),
@@ -41,9 +38,9 @@ fn meshes(robot: &Robot, urdf_folder: &Path) -> Vec<RobotMesh> {
         if meshes.iter().any(|mesh| mesh.file == *file) {
             continue;
         }
-        match read(file, urdf_folder, MAX_TOTAL_BYTES - n_bytes) {
+        match read(file, urdf_folder, budget) {
             Ok(mesh) => {
-                n_bytes += mesh.bytes.len() as u64;
+                budget = budget.after(mesh.bytes.len() as u64);
                 meshes.push(mesh);
             }
             Err(why) => log::warn!("the robot is drawn incompletely: cannot draw the mesh {file:?}: {why}"),
@@ -53,7 +50,7 @@ fn meshes(robot: &Robot, urdf_folder: &Path) -> Vec<RobotMesh> {
 }
 
 /// Reads a mesh file. The error is the reason, in one sentence.
-fn read(file: &str, urdf_folder: &Path, n_free: u64) -> Result<RobotMesh, String> {
+fn read(file: &str, urdf_folder: &Path, left: Budget) -> Result<RobotMesh, String> {
     let format = MeshFormat::of_file(file).ok_or("its type is not supported, convert it to .stl, .dae or .obj")?;
     let candidates = candidates(file, urdf_folder);
     let Some(path) = candidates.iter().find(|path| path.is_file()) else {
@@ -61,12 +58,11 @@ fn read(file: &str, urdf_folder: &Path, n_free: u64) -> Result<RobotMesh, String
         return Err(format!("no such file; tried {}", tried.join(", ")));
     };
     let shown = path.display();
-    let n_bytes = std::fs::metadata(path).map_err(|error| format!("cannot read {shown}: {error}"))?.len();
-    let max_bytes = MAX_FILE_BYTES.min(n_free);
-    if n_bytes > max_bytes {
-        return Err(format!("{shown} has {n_bytes} bytes, expected at most {max_bytes}: reduce its triangles"));
-    }
-    let bytes = files::read(path, max_bytes).map_err(|error| format!("cannot read {shown}: {error}"))?;
+    let max_bytes = Budget::MESH.max_bytes.min(left.max_bytes);
+    let bytes = files::read(path, Budget { max_bytes, ..Budget::MESH }).map_err(|error| match error.kind() {
+        std::io::ErrorKind::FileTooLarge => format!("{shown}: {error}; reduce its triangles"),
+        _ => format!("cannot read {shown}: {error}"),
+    })?;
     Ok(RobotMesh { file: file.to_owned(), format, bytes: bytes.into() })
 }
 

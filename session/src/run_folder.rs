@@ -7,6 +7,7 @@ use keyframe::{Keyframe, listed};
 use keyframe::{bail, ensure};
 use serde::Serialize;
 use sha2::{Digest, Sha256};
+use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
@@ -16,8 +17,8 @@ use trainer::{Edits, Method, ModelKind};
 const RECORDING_EXTENSION: &str = "mcap";
 /// Parent folder of runs without `--out`.
 const RUNS: &str = "runs";
-/// Temporary subfolder in which a model is saved until it is complete.
-const PARTIAL_MODEL: &str = "model.part";
+/// The subfolder in which a model is saved until it is complete has the temporary name of this one.
+const MODEL: &str = "model";
 /// The checkpoint in the folder of a run.
 pub const CHECKPOINT: &str = "training.ckpt";
 /// Subfolder with the keyframes of a run.
@@ -131,7 +132,7 @@ pub fn models_at(path: &Path) -> crate::Result<Vec<PathBuf>> {
     Ok(vec![path.to_owned()])
 }
 
-/// Folders created by this run. They are removed if the run is rejected.
+/// Folders created by this run. They are removed if the run is rejected, or fails at its start.
 #[derive(Debug, Default)]
 pub struct CreatedFolders {
     /// Folders of the run, the innermost first.
@@ -208,7 +209,8 @@ impl CreatedFolders {
         }
     }
 
-    /// Removes the created folders if the command was rejected because of bad input or insufficient data.
+    /// Removes the created folders if the command was rejected because of bad input or insufficient data, or failed before
+    /// it had anything to keep.
     pub fn keep_unless(self, is_rejected: bool) {
         if is_rejected {
             self.remove_created();
@@ -261,8 +263,9 @@ fn make_in(parent: &Path, prefix: &str) -> crate::Result<PathBuf> {
 /// may come from somebody else, and files written through its links would replace other files.
 pub(crate) fn lock(folder: &Path) -> crate::Result<()> {
     let of_methods = ModelKind::ALL.iter().map(|kind| kind.name());
-    for subfolder in [PARTIAL_MODEL, KEYFRAMES].into_iter().chain(of_methods) {
-        files::check_no_link(&folder.join(subfolder)).map_err(|link| Error::BadInput(link.to_string()))?;
+    let subfolders = std::iter::once(KEYFRAMES).chain(of_methods).map(|name| folder.join(name));
+    for subfolder in subfolders.chain([partial_model(folder)]) {
+        files::check_no_link(&subfolder).map_err(|link| Error::BadInput(link.to_string()))?;
     }
     let path = folder.join(LOCK);
     match files::lock(&path).with_context(|| format!("cannot write {}", path.display()))? {
@@ -275,14 +278,17 @@ pub(crate) fn lock(folder: &Path) -> crate::Result<()> {
     Ok(())
 }
 
+/// Temporary subfolder in which a model is saved until it is complete.
+fn partial_model(folder: &Path) -> PathBuf {
+    files::partial::path_of(&folder.join(MODEL))
+}
+
 /// Saves a model and its edits in a temporary subfolder and moves its files into place once it is complete.
 pub fn save_model(method: &mut dyn Method, edits: &Edits, folder: &Path) -> crate::Result<()> {
-    let partial_folder = folder.join(PARTIAL_MODEL);
-    if partial_folder.exists() {
-        // An earlier run was killed while saving.
-        std::fs::remove_dir_all(&partial_folder)
-            .with_context(|| format!("cannot remove {}", partial_folder.display()))?;
-    }
+    let partial_folder = partial_model(folder);
+    // Left over if an earlier run was killed while saving. No other run saves now, because this one has locked the folder.
+    let model_files: Vec<&OsStr> = ModelKind::model_files().map(OsStr::new).collect();
+    files::partial::remove_leftover(&partial_folder, &model_files)?;
     let save_edited = |method: &mut dyn Method| match edits.is_empty() {
         true => Ok(()),
         false => method.write_for_others(&partial_folder, edits),
@@ -328,7 +334,8 @@ pub fn checkpoint_sha256(folder: &Path) -> crate::Result<String> {
         if !path.exists() {
             continue;
         }
-        let bytes = files::read(&path, files::NO_LIMIT).with_context(|| format!("cannot read {}", path.display()))?;
+        let bytes =
+            files::read(&path, files::Budget::PLAIN).with_context(|| format!("cannot read {}", path.display()))?;
         hash.update(format!("{name} {}\n", bytes.len()));
         hash.update(&bytes);
         n_files += 1;

@@ -37,7 +37,8 @@ use std::time::{Duration, Instant};
 use trainer::edits::Floaters;
 use trainer::gpu::Gpu;
 use trainer::{
-    Edits, FailedModel, Method, ModelKind, Packing, Picture, Progress, QueuedPicture, RenderRequest, Rendered,
+    Edits, FailedModel, InitialPoints, Method, ModelKind, Packing, Picture, Progress, QueuedPicture, RenderRequest,
+    Rendered,
 };
 use training_time::TrainingTime;
 use viz::EditRequest;
@@ -51,6 +52,8 @@ const MAX_LIVE_STEP_MILLIS: f64 = 300.0;
 pub struct Session {
     method: Box<dyn Method>,
     gpu: Arc<Gpu>,
+    /// Points from which a new model without depth starts.
+    initial_points: Option<Arc<InitialPoints>>,
     /// Keyframes in the store, in order of arrival.
     keyframes: Vec<Arc<Keyframe>>,
     /// Corrections optimized with the scene, as last read.
@@ -77,6 +80,7 @@ impl Session {
         Self {
             method,
             gpu,
+            initial_points: None,
             keyframes: Vec::new(),
             learned: BTreeMap::new(),
             time: TrainingTime::new(limits),
@@ -86,6 +90,22 @@ impl Session {
             stop: Stop::default(),
             edits: Arc::default(),
         }
+    }
+
+    /// Starts at these points if no keyframe has depth. Logs a warning if the method does not use points.
+    pub fn with_initial_points(mut self, points: Option<Arc<InitialPoints>>) -> Self {
+        self.initial_points = points;
+        if !self.set_initial_points() {
+            let method = self.kind().name();
+            log::warn!("the method {method} does not start from points: those of the dataset are not used");
+        }
+        self
+    }
+
+    /// Passes the initial points to the model. Returns false if there are some, but the model does not use them.
+    fn set_initial_points(&mut self) -> bool {
+        let Self { method, initial_points, .. } = self;
+        initial_points.as_ref().is_none_or(|points| method.set_initial_points(points))
     }
 
     /// Enables checkpoints.
@@ -467,6 +487,7 @@ impl Session {
     pub fn restart_on(&mut self, gpu: &Arc<Gpu>) -> crate::Result<()> {
         self.method = self.persistence.restore(gpu, &self.keyframes)?;
         self.gpu = gpu.clone();
+        self.set_initial_points();
         self.time.unmark_finished();
         // Drops an evaluation in progress: all of its images must be scored on the same model state, which is lost.
         self.scoreboard.take_pending();

@@ -9,8 +9,9 @@ use image::codecs::png::{CompressionType, FilterType, PngEncoder};
 use image::{ExtendedColorType, ImageEncoder};
 use keyframe::ensure;
 use keyframe::{BaseState, DepthMap, Keyframe, split_from_name, split_name};
-use kinematics::{Stamp, Transform, Twist};
-use nalgebra::{Quaternion, Translation3, UnitQuaternion, Vector3};
+use kinematics::transform::{from_xyz_xyzw, to_xyz_xyzw};
+use kinematics::{Stamp, Twist};
+use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -142,7 +143,7 @@ fn to_checkpoint(keyframe: &Keyframe) -> crate::Result<Checkpoint> {
         size_px: keyframe.size_px,
         focal_px: keyframe.focal_px,
         principal_px: keyframe.principal_px,
-        world_from_camera: numbers(&keyframe.world_from_camera),
+        world_from_camera: to_xyz_xyzw(&keyframe.world_from_camera),
         twist: keyframe.twist.as_ref().map(twist_numbers),
         readout_secs: keyframe.readout_secs,
         joint_twists: keyframe.joint_twists.iter().map(twist_numbers).collect(),
@@ -151,12 +152,12 @@ fn to_checkpoint(keyframe: &Keyframe) -> crate::Result<Checkpoint> {
             size_px: depth.size_px,
             focal_px: depth.focal_px,
             principal_px: depth.principal_px,
-            world_from_camera: numbers(&depth.world_from_camera),
+            world_from_camera: to_xyz_xyzw(&depth.world_from_camera),
         }),
         base: keyframe.base.as_ref().map(|base| BaseDescription {
             station: base.station,
-            world_from_base: numbers(&base.world_from_base),
-            map_from_odom: numbers(&base.map_from_odom),
+            world_from_base: to_xyz_xyzw(&base.world_from_base),
+            map_from_odom: to_xyz_xyzw(&base.map_from_odom),
         }),
     };
     let mut arrays = vec![Array { name: COLOR.to_owned(), bytes: png(keyframe.size_px, &keyframe.rgba_srgb)? }];
@@ -194,7 +195,7 @@ fn keyframe_of(checkpoint: &Checkpoint) -> crate::Result<Keyframe> {
             focal_px: depth.focal_px,
             principal_px: depth.principal_px,
             depth_m: depth_m.collect(),
-            world_from_camera: transform(depth.world_from_camera),
+            world_from_camera: from_xyz_xyzw(depth.world_from_camera),
         })
     });
     Ok(Keyframe {
@@ -205,14 +206,14 @@ fn keyframe_of(checkpoint: &Checkpoint) -> crate::Result<Keyframe> {
         principal_px: metadata.principal_px,
         rgba_srgb: pixels(COLOR, metadata.size_px)?.into(),
         depth: depth.transpose()?,
-        world_from_camera: transform(metadata.world_from_camera),
+        world_from_camera: from_xyz_xyzw(metadata.world_from_camera),
         twist: metadata.twist.map(twist),
         readout_secs: metadata.readout_secs,
         joint_twists: metadata.joint_twists.into_iter().map(twist).collect(),
         base: metadata.base.map(|base| BaseState {
             station: base.station,
-            world_from_base: transform(base.world_from_base),
-            map_from_odom: transform(base.map_from_odom),
+            world_from_base: from_xyz_xyzw(base.world_from_base),
+            map_from_odom: from_xyz_xyzw(base.map_from_odom),
             truth: None,
         }),
         split: split_from_name(&metadata.split).with_context(|| format!("unknown split {:?}", metadata.split))?,
@@ -229,18 +230,6 @@ fn png([width, height]: [u32; 2], bytes: &[u8]) -> crate::Result<Vec<u8>> {
     Ok(png)
 }
 
-/// The translation, then the quaternion with its real part last.
-fn numbers(pose: &Transform) -> [f64; 7] {
-    let [x, y, z] = pose.translation.vector.into();
-    let [i, j, k, w] = pose.rotation.coords.into();
-    [x, y, z, i, j, k, w]
-}
-
-/// The bit-exact inverse of [`numbers`].
-fn transform([x, y, z, i, j, k, w]: [f64; 7]) -> Transform {
-    Transform::from_parts(Translation3::new(x, y, z), UnitQuaternion::new_unchecked(Quaternion::new(w, i, j, k)))
-}
-
 fn twist_numbers(twist: &Twist) -> [f64; 6] {
     let ([x, y, z], [a, b, c]) = (twist.linear_m_s.into(), twist.angular_rad_s.into());
     [x, y, z, a, b, c]
@@ -254,6 +243,7 @@ fn twist([x, y, z, a, b, c]: [f64; 6]) -> Twist {
 mod tests {
     use super::*;
     use keyframe::Split;
+    use kinematics::Transform;
 
     fn keyframe(stamp_nanos: i64, depth: bool) -> Arc<Keyframe> {
         let pose = Transform::new(Vector3::new(0.1, 1.0 / 3.0, -2.0), Vector3::new(0.3, -0.2, 0.1));

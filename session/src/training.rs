@@ -15,12 +15,14 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 use trainer::gpu::Gpu;
 use trainer::splat::CountPolicy;
-use trainer::{self, CommonOptions, ModelKind, ModelSpec};
+use trainer::{self, CommonOptions, InitialPoints, ModelKind, ModelSpec};
 
 /// All inputs of a training run except its keyframes.
 pub struct TrainingPlan {
     /// Method and options of the model.
     pub model_spec: ModelSpec,
+    /// Points from which the model starts if no keyframe has depth.
+    pub initial_points: Option<Arc<InitialPoints>>,
     /// How the model is scored.
     pub evaluators: Evaluators,
     /// When to stop.
@@ -43,7 +45,8 @@ pub fn train(
     let kind = plan.model_spec.kind;
     let mut method = plan.model_spec.start(gpu.clone())?;
     method.prepare()?;
-    let mut session = Session::new(gpu, (kind, method), plan.evaluators, plan.limits, plan.observer).with_stop(stop);
+    let session = Session::new(gpu, (kind, method), plan.evaluators, plan.limits, plan.observer);
+    let mut session = session.with_stop(stop).with_initial_points(plan.initial_points);
     drive(std::slice::from_mut(&mut session), keyframes, preparation_time, stop, open_gpu)?;
     Ok(session)
 }
@@ -70,7 +73,7 @@ pub fn drive(
                 ModelKind::ALL.iter().filter(|kind| !kind.entry().needs_depth).map(|kind| kind.name()).collect();
             return Err(Error::InsufficientData(format!(
                 "the method {} needs depth, but no training image has depth: \
-                 use --depth-from to render depth from another model of the scene, or use the method {}",
+                 use `fieldrig train --depth-from` to render depth from another model of the scene, or use the method {}",
                 session.kind().name(),
                 listed(&others, "or")
             )));

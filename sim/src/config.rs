@@ -1,7 +1,7 @@
 //! Configuration of a simulated rig: scene, cameras, sensor imperfections, and end conditions.
 
 use crate::Error;
-use kinematics::{Intrinsics, Lens, Transform};
+use kinematics::{Intrinsics, Lens, Transform, transform};
 use nalgebra::{Translation3, UnitQuaternion, Vector3};
 use targets::TargetSpec;
 
@@ -513,8 +513,7 @@ fn check_lens(of: &str, lens: &Intrinsics) -> Result<(), Error> {
 }
 
 fn check_pose(of: &str, key: &'static str, pose: &Transform) -> Result<(), Error> {
-    let mut numbers = pose.translation.vector.iter().chain(pose.rotation.coords.iter());
-    numbers.try_for_each(|number| check(of, key, *number, -100.0, 100.0))
+    transform::to_xyz_xyzw(pose).into_iter().try_for_each(|number| check(of, key, number, -100.0, 100.0))
 }
 
 /// Rejects numbers outside `lower..=upper`, and NaN.

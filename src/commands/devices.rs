@@ -72,11 +72,11 @@ fn gpu() -> DeviceInfo {
 fn simulation() -> DeviceInfo {
     let usable = cfg!(feature = "sim");
     let note = if usable {
-        "`--sim` simulates all devices of a rig"
+        "`fieldrig run --sim` simulates all devices of a rig"
     } else {
         "built without simulation; run `make deps`, then `cargo build --release --features sim`"
     };
-    DeviceInfo { kind: "simulation", address: "--sim".into(), name: "MuJoCo".into(), usable, note: note.into() }
+    DeviceInfo { kind: "simulation", address: "run --sim".into(), name: "MuJoCo".into(), usable, note: note.into() }
 }
 
 /// V4L2 capture devices with their image modes.

@@ -74,6 +74,6 @@ fn simulation() -> Finding {
         Finding::ok("simulation", "MuJoCo is built in")
     } else {
         let remedy = "make deps && cargo build --release --features sim";
-        Finding::warn("simulation", "built without MuJoCo: `--sim` is not available", remedy)
+        Finding::warn("simulation", "built without MuJoCo: `fieldrig run --sim` is not available", remedy)
     }
 }

@@ -16,7 +16,7 @@ use std::sync::Arc;
 /// Flags of `eval`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// Folder of a saved model, or a splat file (.ply, .spz)
+    /// Folder of a saved model, or a splat file (.ply, .spz, .splat)
     model: PathBuf,
     /// The data it was trained on, or other data of the same scene in the same world frame
     data: PathBuf,
@@ -51,7 +51,9 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     // Invalid flags are rejected before the data is read, which takes long.
     args.images.options().holdout()?;
     session::expect(&args.data)?;
-    let mut model = methods::load(open_gpu()?, &args.model)?.method;
+    let loaded = methods::load(open_gpu()?, &args.model)?;
+    let is_empty = methods::note_if_empty(&args.model, &loaded).is_some();
+    let mut model = loaded.method;
     let overrides = training_overrides(&args.model);
     let bar = ReadBar::new(args.json);
     let data = Data::load(&args.data, &args.images.options(), Purpose::Scoring, &overrides, &|read| bar.show(read))?;
@@ -69,7 +71,9 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let images =
         evaluator.score_all(model.as_mut(), tests.iter(), |_, n_scored| scored.set_position(n_scored as u64))?;
     scored.finish_and_clear();
-    warn_if_hardly_covered(&images.iter().filter_map(|image| image.covered_frac).collect::<Vec<_>>());
+    if !is_empty {
+        warn_if_hardly_covered(&images.iter().filter_map(|image| image.covered_frac).collect::<Vec<_>>());
+    }
     let scores = Scores::mean(&images);
     let is_test = |keyframe: &Keyframe| keyframe.split == Split::Test;
     let names = data.keyframes.iter().zip(data.names).filter(|(keyframe, _)| is_test(keyframe)).map(|(_, name)| name);

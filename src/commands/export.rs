@@ -2,6 +2,7 @@
 
 use crate::exit::{self, BadArgument, Exit};
 use crate::open_gpu::open_gpu;
+use crate::permission_args::PermissionArgs;
 use crate::{print, signals};
 use anyhow::{Context, ensure};
 use capture::config::{Override, Rig};
@@ -17,7 +18,7 @@ use trainer::method_entry::{Export, ExportRequest, ExportWriter, Exported};
 /// Flags of `export`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// A model folder, a splat file (.ply, .spz), or a recording (MCAP)
+    /// A model folder, a splat file (.ply, .spz, .splat), or a recording (MCAP)
     #[arg(value_name = "MODEL|REC")]
     from: PathBuf,
     /// Output format
@@ -35,6 +36,8 @@ pub(crate) struct Args {
     /// Use this rig file instead of the recording's
     #[arg(long, value_name = "RIG.toml")]
     rig: Option<PathBuf>,
+    #[command(flatten)]
+    pub(crate) permissions: PermissionArgs,
 }
 
 /// The output format for recordings: a folder.

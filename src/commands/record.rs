@@ -2,6 +2,7 @@
 
 use super::number_in_range;
 use crate::exit::{self, BadArgument, Exit, InsufficientData};
+use crate::permission_args::PermissionArgs;
 use crate::{print, signals};
 use capture::config::{ArmDriver, BaseDriver, Override, Rig};
 use capture::open::{self, Devices, Opened};
@@ -30,6 +31,8 @@ pub(crate) struct Args {
     /// unless the rig file ends the simulation]
     #[arg(long, value_name = "S", value_parser = number_in_range(0.1..=1e7))]
     seconds: Option<f64>,
+    #[command(flatten)]
+    pub(crate) permissions: PermissionArgs,
     /// Print JSON, one object per line
     #[arg(long)]
     json: bool,

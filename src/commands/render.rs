@@ -24,7 +24,7 @@ const MAX_SIDE_PX: u32 = 16_384;
 #[derive(Debug, clap::Args)]
 #[command(group(clap::ArgGroup::new("where").required(true)))]
 pub(crate) struct Args {
-    /// Folder of a saved model, or a splat file (.ply, .spz)
+    /// Folder of a saved model, or a splat file (.ply, .spz, .splat)
     model: PathBuf,
     /// Camera path in nerfstudio's format (JSON)
     #[arg(long, value_name = "FILE", group = "where")]
@@ -116,7 +116,9 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     expect_model(&args.model)?;
     check_no_overwrite(&args.out, requests.len())?;
     signals::remove_partial_files_on_signals()?;
-    let LoadedModel { method: mut model, edits, .. } = methods::load(open_gpu()?, &args.model)?;
+    let loaded = methods::load(open_gpu()?, &args.model)?;
+    let is_empty = methods::note_if_empty(&args.model, &loaded).is_some();
+    let LoadedModel { method: mut model, edits, .. } = loaded;
     let edits = Arc::new(edits);
     std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create the folder {}", args.out.display()))?;
     let bar = print::bar(Some(requests.len() as u64), "{bar:30} {pos} of {len}", args.json);
@@ -134,7 +136,9 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         }
     }
     bar.finish_and_clear();
-    warn_if_hardly_covered(&covered_fracs);
+    if !is_empty {
+        warn_if_hardly_covered(&covered_fracs);
+    }
     if !args.json {
         let n_pictures = counted(requests.len() as u64, "image");
         print::report(format_args!("{n_pictures} in {}", args.out.display()));

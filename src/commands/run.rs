@@ -6,6 +6,7 @@ use crate::console::{Console, OutputMode, print_next_commands};
 use crate::exit::{self, BadArgument, Exit, InsufficientData};
 use crate::open_gpu::open_gpu;
 use crate::page_args::PageArgs;
+use crate::permission_args::PermissionArgs;
 use crate::served_page::ServedPage;
 use crate::training_args::TrainingArgs;
 use crate::{print, signals};
@@ -90,6 +91,8 @@ pub(crate) struct Args {
     #[arg(long, value_name = "FOLDER")]
     out: Option<PathBuf>,
     #[command(flatten)]
+    pub(crate) permissions: PermissionArgs,
+    #[command(flatten)]
     checkpoints: CheckpointArgs,
     /// At a limit, keep serving the page until Ctrl-C, or exit [default: stay on a terminal without --json, else exit]
     #[arg(long, value_name = "WHAT")]
@@ -153,13 +156,15 @@ struct RunDetails {
 
 /// Runs until a limit, the end of the devices, or Ctrl-C; saves the model, its keyframes and the effective rig file.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
-    let mut created = CreatedFolders::default();
-    let result = drive(args, &mut created);
-    created.keep_unless(result.as_ref().is_err_and(exit::is_rejection));
+    let (mut created, mut has_keyframes) = (CreatedFolders::default(), false);
+    let result = drive(args, &mut created, &mut has_keyframes);
+    // The folder of a run that failed before its first keyframe contains nothing of use.
+    created.keep_unless(result.as_ref().is_err_and(|error| !has_keyframes || exit::is_rejection(error)));
     result
 }
 
-fn drive(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
+/// Runs and saves. Sets `has_keyframes` as soon as the run is over.
+fn drive(args: &Args, created: &mut CreatedFolders, has_keyframes: &mut bool) -> anyhow::Result<Exit> {
     let previous = args.resume.as_deref().map(PreviousRun::read).transpose()?;
     if let Some(previous) = &previous
         && args.is_finished(previous)
@@ -184,6 +189,7 @@ fn drive(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
         }
     };
     let Running { live, rig, folders, damage, stop, page, .. } = running;
+    *has_keyframes = !live.keyframes().is_empty();
     let hub = live.hub();
     if let Err(error) = result {
         stop.request();
@@ -378,6 +384,7 @@ pub(super) fn start(
             adapter: gpu.describe(),
             scale: rig.train.scale,
             depth_from: None,
+            points: None,
             from_step,
             options: options.clone(),
         };

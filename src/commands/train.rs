@@ -5,6 +5,7 @@ use crate::console::{Console, OutputMode, ReadBar, print_next_commands};
 use crate::data_args::DataArgs;
 use crate::exit::{self, BadArgument, Exit};
 use crate::open_gpu::open_gpu;
+use crate::permission_args::PermissionArgs;
 use crate::training_args::TrainingArgs;
 use crate::{print, signals};
 use capture::StationReport;
@@ -16,7 +17,8 @@ use session::next_commands::{DataSource, quoted};
 use session::run_folder::{self, CreatedFolders};
 use session::{
     Checkpoints, Clock, Data, DecisionLog, EndingSession, Evaluator, Evaluators, KeptFolder, Limits, Purpose, REALIGN,
-    Recovery, Replay, RunDescription, RunFlags, Session, Settings, checkpoints, corrected_rig, recoveries, recovery,
+    Recovery, Replay, RunDescription, RunFlags, Session, Settings, checkpoints, corrected_rig, points_sha256,
+    recoveries, recovery,
 };
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -82,6 +84,8 @@ pub(crate) struct Args {
     /// to it
     #[arg(long, value_name = "FILE")]
     write_rig: Option<PathBuf>,
+    #[command(flatten)]
+    pub(crate) permissions: PermissionArgs,
     #[command(flatten)]
     checkpoints: CheckpointArgs,
     /// Print the GPU time of each kernel at the end
@@ -194,8 +198,11 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
     if let Some(source) = &depth_from {
         data.render_depth(gpu.clone(), source, &|read| bar.show(read))?;
     }
+    let initial_points = data.initial_points();
+    let initial_points_sha256 = initial_points.as_deref().map(points_sha256);
     if let Some(replay) = &replay {
         replay.check_data(&args.data, &data)?;
+        replay.check_points(initial_points_sha256.as_deref())?;
     }
     let mut models = args.models(&gpu, &data, replay.as_ref(), checkpoint.as_ref())?;
     let from_step = checkpoint.is_some().then(|| models[0].method.n_total_steps()).transpose()?;
@@ -235,6 +242,7 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
             adapter: gpu.describe(),
             scale: data.rig.as_ref().map(|rig| rig.train.scale).or(images.scale).unwrap_or(1.0),
             depth_from: run_flags.depth_from.clone(),
+            points: initial_points_sha256.clone(),
             from_step,
             options,
         };
@@ -254,6 +262,7 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
         let checkpoints = Checkpoints::new(folder, args.checkpoints.options());
         let session = Session::new(gpu.clone(), (kind, method), evaluators.clone(), limits, Box::new(console))
             .with_stop(&stop)
+            .with_initial_points(initial_points.clone())
             .with_edits(edits)
             .with_checkpoints(checkpoints.map(|to| to.with_flags(run_flags.clone())))
             .with_profile(args.profile)

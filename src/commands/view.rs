@@ -16,7 +16,7 @@ use viz::{Hub, KeyframePose, ModelStatus, SceneHint, Status};
 /// Flags of `view`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// Folder of a saved model or of a run with several methods, or a splat file (.ply, .spz)
+    /// Folder of a saved model or of a run with several methods, or a splat file (.ply, .spz, .splat)
     model: PathBuf,
     #[command(flatten)]
     page: PageArgs,
@@ -69,6 +69,8 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let models = paths.iter().map(|path| methods::load(gpu.clone(), path));
     let mut models = models.collect::<session::Result<Vec<LoadedModel>>>()?;
     let bounds = if cameras.is_empty() { bounds(&mut models)? } else { None };
+    let empty_notes = paths.iter().zip(&models).filter_map(|(path, model)| methods::note_if_empty(path, model));
+    let notes = notes(&gpu).into_iter().chain(empty_notes).collect();
     let mut statuses = paths.iter().zip(&models).map(|(path, model)| model_status(path, model));
     let report = report(&paths[0]);
     let status = Status {
@@ -77,7 +79,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         keyframes: cameras.len() as u64,
         model: statuses.next().unwrap_or_default(),
         others: statuses.collect(),
-        notes: notes(&gpu),
+        notes,
         ..Status::default()
     };
     let cameras = in_page(cameras, &model_from_page);

@@ -280,9 +280,7 @@ impl fmt::Display for Ids {
             return write!(f, "{} to {}", self.0[0], self.0[self.0.len() - 1]);
         }
         const SHOWN: usize = 8;
-        let shown: Vec<String> = self.0.iter().take(SHOWN).map(u32::to_string).collect();
-        f.write_str(&shown.join(", "))?;
-        if self.0.len() > SHOWN { write!(f, " and {} more", self.0.len() - SHOWN) } else { Ok(()) }
+        f.write_str(&kinematics::shortened(&self.0, SHOWN, ", "))
     }
 }
 

@@ -5,6 +5,7 @@ use kinematics::{Intrinsics, Lens, Transform, transform};
 use nalgebra::{UnitQuaternion, Vector3};
 use serde_json::{Value, json};
 use std::path::Path;
+use std::process::{Command, Stdio};
 use targets::TargetSpec;
 use targets::synthetic::{View, render};
 
@@ -216,6 +217,23 @@ fn results_are_written_into_a_rig_file() {
     assert!((x_m - flange_from_camera().translation.x).abs() < 1e-6, "{x_m}");
     assert_eq!(camera["intrinsics"]["focal_px"][0].as_float(), Some(focal_px), "the intrinsics are kept");
     assert!(folder.path().join("new.toml.old").exists());
+
+    // Two programs write the same file at once: no result disappears.
+    let both = ["--rig", "new.toml", "--camera", "wrist", "--write-rig", "both.toml"];
+    let start = || {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_fieldrig"));
+        command.args(["calibrate", "hand-eye", "samples.json"]).args(both).current_dir(folder.path());
+        command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().expect("it starts")
+    };
+    let outputs = [start(), start()].map(|child| child.wait_with_output().expect("it ends"));
+    let (done, refused): (Vec<_>, Vec<_>) = outputs.iter().partition(|output| output.status.success());
+    for output in refused {
+        assert!(stderr(output).contains("both.toml: another program is writing it"), "{}", stderr(output));
+    }
+    let entries = std::fs::read_dir(folder.path()).expect("a folder");
+    let names = entries.map(|entry| entry.expect("an entry").file_name().to_string_lossy().into_owned());
+    let names: Vec<String> = names.filter(|name| name.contains("both.toml")).collect();
+    assert!(!done.is_empty() && names.len() == done.len(), "{} wrote {names:?}", done.len());
 
     // Nothing is written if something is wrong.
     let rejected = |args: &[&str], expected: i32, words: &str| {

@@ -203,10 +203,20 @@ fn image_formats() {
 }
 
 #[test]
-fn initial_points_are_named() {
+fn training_starts_at_initial_points() {
     let Some(case) = Case::open("cases/initial_points") else { return };
-    let (code, printed, _) = case.train(".", "r");
-    assert!(code == Some(0) && printed.contains("the points in ply_file_path (\"sparse_pc.ply\")"), "{printed}");
+    let train = |out: &str| {
+        let (code, printed, cameras) = case.train(".", out);
+        assert_eq!((code, cameras.is_empty()), (Some(0), false), "{printed}");
+        (std::fs::read(case.at(out).join("splats.ply")).unwrap(), printed)
+    };
+    let (with_points, printed) = train("with");
+    assert!(printed.contains("sparse_pc.ply: splats start at 736 points"), "{printed}");
+    assert_eq!(train("again").0, with_points, "the result is reproducible");
+    std::fs::write(case.at("sparse_pc.ply"), "ply\nformat ascii 1.0\nend_header\n").unwrap();
+    let (without_points, printed) = train("damaged");
+    assert!(printed.contains("starts without the points of the dataset: cannot parse"), "{printed}");
+    assert!(printed.contains("element \"vertex\" is missing") && without_points != with_points, "{printed}");
 }
 
 #[test]
@@ -286,6 +296,26 @@ fn calibrations_of_ros() {
     // The case has no images: reading goes on beyond the intrinsics.
     let (code, printed) = case.run(&["calibrate", "hand-eye", "samples_with_camera_info.json"]);
     assert!(code == Some(2) && printed.contains("00.png") && !printed.contains("camera_matrix"), "{printed}");
+    // The same parameters in a file of their own.
+    let samples = std::fs::read_to_string(case.at("samples_with_camera_info.json")).unwrap();
+    let mut samples: Value = serde_json::from_str(&samples).unwrap();
+    samples["intrinsics"] = "ost.yaml".into();
+    std::fs::write(case.at("samples.json"), samples.to_string()).unwrap();
+    let calibrate_with = |model: &str, rotation: &str| {
+        let info = format!(
+            "image_width: 640\nimage_height: 480\ncamera_matrix:\n  rows: 3\n  cols: 3\n  \
+             data: [610., 0., 322.4, 0., 608., 241.1, 0., 0., 1.]\ndistortion_model: {model}\n\
+             distortion_coefficients: {{rows: 1, cols: 4, data: [0.1, 0., 0., 0.]}}\n\
+             rectification_matrix: {{rows: 3, cols: 3, data: {rotation}}}\n"
+        );
+        std::fs::write(case.at("ost.yaml"), info).unwrap();
+        case.run(&["calibrate", "hand-eye", "samples.json"])
+    };
+    let (code, printed) = calibrate_with("equidistant", "[0, 1, 0, -1, 0, 0, 0, 0, 1]");
+    assert!(code == Some(2) && printed.contains("00.png"), "{printed}");
+    assert!(printed.contains("ost.yaml: not used") && printed.contains("rectification_matrix"), "{printed}");
+    let (code, printed) = calibrate_with("omni", "[1, 0, 0, 0, 1, 0, 0, 0, 1]");
+    assert!(code == Some(2) && printed.contains("intrinsics: ost.yaml: distortion_model \"omni\""), "{printed}");
 }
 
 #[test]

@@ -214,7 +214,8 @@ fn invalid_arguments_exit_with_2() {
         assert_fails_with(&["metrics", "a.png", "b.png", &format!("--meters-per-count={meters}")], 2, &["above 0"]);
     }
     assert_fails_with(&["render", "model", "--pose", "1 2 3"], 2, &["16"]);
-    assert_fails_with(&["render", "model", "--pose", "2 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"], 2, &["not rigid"]);
+    let scaled = ["render", "model", "--pose", "2 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"];
+    assert_fails_with(&scaled, 2, &["not rigid", "expected a rotation without scale and shear"]);
     assert_fails_with(&["render", "model"], 2, &["--camera-path"]);
     assert_fails_with(&["run", "rig.toml", "--sim", "--from", "scan.mcap"], 2, &["--from"]);
 }

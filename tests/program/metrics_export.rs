@@ -5,6 +5,7 @@ use image::{ExtendedColorType, RgbaImage};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
+use trainer::splat::arrays::SplatArrays;
 use trainer::splat::cloud::synthetic_cloud;
 use trainer::splat::{ply, spz};
 
@@ -162,4 +163,30 @@ fn model_round_trips_through_spz() {
     let again = folder.path().join("cut.ply");
     let stderr_text = error_message(&fieldrig(&["export", text(&spz_file), "--to", "ply", "--out", text(&again)]), 1);
     assert!(stderr_text.contains("scene.spz") && stderr_text.contains("truncated"), "{stderr_text}");
+}
+
+#[test]
+fn absurd_splats_and_empty_models_are_reported() {
+    let folder = tempfile::tempdir().unwrap();
+    let [absurd_file, empty_file, out] = ["absurd.ply", "empty.ply", "out.ply"].map(|name| folder.path().join(name));
+    let mut absurd = synthetic_cloud(20, 1);
+    absurd.log_scales[7][0] = 200.0;
+    ply::write(&absurd_file, &absurd).unwrap();
+    let output = fieldrig(&["export", text(&absurd_file), "--to", "ply", "--out", text(&out)]);
+    assert!(output.status.success(), "{output:?}");
+    let stderr_text = String::from_utf8_lossy(&output.stderr);
+    let expected = "left out 1 of 20 splats with invalid numbers; the first has index 7: a standard deviation exceeds";
+    assert!(stderr_text.contains("absurd.ply") && stderr_text.contains(expected), "{stderr_text}");
+    assert_eq!(ply::read(&out).unwrap().n_splats(), 19);
+
+    ply::write(&empty_file, &SplatArrays::default()).unwrap();
+    let pictures = folder.path().join("pictures");
+    let pose = "1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1";
+    let view = ["--pose", pose, "--size", "16x16", "--out", text(&pictures)];
+    let output = fieldrig(&[&["render", text(&empty_file)][..], &view].concat());
+    assert!(output.status.success() && pictures.join("00000.png").is_file(), "{output:?}");
+    let stderr_text = String::from_utf8_lossy(&output.stderr);
+    let expected = "empty.ply contains no splats: its pictures show only the background";
+    assert!(stderr_text.contains(expected), "{stderr_text}");
+    assert!(!stderr_text.contains("the model covers"), "one warning is enough: {stderr_text}");
 }

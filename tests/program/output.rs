@@ -196,6 +196,49 @@ fn runs_and_recordings_survive_a_closed_terminal() {
     }
 }
 
+/// Kills exports while they write. The folder is complete or absent, and the next export replaces what is left.
+#[cfg(feature = "sim")]
+#[test]
+fn killed_export_is_complete_or_absent() {
+    const N_KILLS: u64 = 3;
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    small_rig::write(folder, small_rig::Pace::Lockstep);
+    let record = ["record", "rig.toml", "--sim", "--seconds", "6", "--out", "scan.mcap"];
+    let recorded = wall::fieldrig(folder, &record);
+    assert!(recorded.status.success(), "{}", String::from_utf8_lossy(&recorded.stderr));
+    let images = |out: &str| std::fs::read_dir(folder.join(out).join("images")).unwrap().count();
+    let expect_complete = |out: &str| {
+        let n_expected = images("scan.mcap-exported");
+        assert!(folder.join(out).join("transforms.json").exists() && images(out) == n_expected, "{out}");
+    };
+    expect_recording(folder, "scan.mcap");
+    expect_complete("scan.mcap-exported");
+    for kill in 0..N_KILLS {
+        let out = format!("killed{kill}");
+        let unfinished = folder.join(format!(".{out}.fieldrig.part"));
+        let export = ["export", "scan.mcap", "--to", "nerfstudio", "--out", &out];
+        let mut command = Command::new(EXE);
+        command.args(export).current_dir(folder).stdout(Stdio::null()).stderr(Stdio::null());
+        let mut running = command.spawn().unwrap();
+        let started = Instant::now();
+        while !unfinished.exists() && running.try_wait().unwrap().is_none() {
+            assert!(started.elapsed() < TIMEOUT, "it does not write");
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        std::thread::sleep(Duration::from_millis(5 * kill));
+        running.kill().unwrap();
+        running.wait().unwrap();
+        if !folder.join(&out).exists() {
+            let again = wall::fieldrig(folder, &export);
+            assert!(again.status.success(), "{}", String::from_utf8_lossy(&again.stderr));
+            assert!(!unfinished.exists(), "what is left is removed");
+        }
+        // An export that was faster than the kill is complete, too.
+        expect_complete(&out);
+    }
+}
+
 /// A small disk, unmounted on drop.
 #[cfg(feature = "sim")]
 struct SmallDisk<'a>(&'a Path);
@@ -260,7 +303,7 @@ fn full_disk_keeps_recording_readable_and_saves_model_elsewhere() {
     assert!(printed.contains("cannot save the model in disk/out; it was saved in "), "{printed}");
     let saved = std::fs::read_dir(&temporary).unwrap().next().unwrap().unwrap().path();
     expect_model(folder, saved.strip_prefix(folder).unwrap().to_str().unwrap());
-    assert!(!disk.join("out/model.part").exists(), "the incomplete file is removed");
+    assert!(!disk.join("out/.model.fieldrig.part").exists(), "the incomplete file is removed");
 
     std::fs::remove_dir_all(disk.join("out")).unwrap();
     let output = train(&disk);

@@ -42,12 +42,12 @@ fn links_in_a_received_run_are_not_followed() {
     let names = [
         "decisions-from-4.jsonl",
         ".lock",
-        "training.ckpt.part",
-        "report.json.part",
+        ".training.ckpt.fieldrig.part",
+        ".report.json.fieldrig.part",
         "report.html",
-        "keyframes.txt.part",
-        "cameras.json.part",
-        "model.part",
+        ".keyframes.txt.fieldrig.part",
+        ".cameras.json.fieldrig.part",
+        ".model.fieldrig.part",
         "keyframes",
     ];
     for (ix, name) in names.into_iter().enumerate() {
@@ -55,7 +55,7 @@ fn links_in_a_received_run_are_not_followed() {
         let link = folder.join("run").join(name);
         let _ = std::fs::remove_file(&link); // Most are not there.
         let _ = std::fs::remove_dir_all(&link);
-        let is_folder = ["model.part", "keyframes"].contains(&name);
+        let is_folder = [".model.fieldrig.part", "keyframes"].contains(&name);
         symlink(if is_folder { folder.join("elsewhere") } else { precious.clone() }, &link).unwrap();
         let n_steps = (5 + ix).to_string();
         let resumed = run(folder, &["train", "data", "--resume", "run", "--steps", &n_steps]);
@@ -71,6 +71,43 @@ fn links_in_a_received_run_are_not_followed() {
         assert_eq!(std::fs::read(&precious).unwrap(), b"precious data", "{name}");
         assert_eq!(std::fs::read_dir(folder.join("elsewhere")).unwrap().count(), 0, "{name}");
         assert!(!link.is_symlink(), "{name}");
+    }
+}
+
+/// Downloads and editors use such names, too.
+#[test]
+fn files_of_users_that_end_in_part_are_kept() {
+    let received = received();
+    let folder = received.path();
+    let names = [
+        "run/training.ckpt.part",
+        "run/report.json.part",
+        "run/keyframes.txt.part",
+        "run/model.part/notes.txt",
+        "scene.spz.part",
+        ".scene.spz.part",
+    ];
+    for name in names {
+        let path = folder.join(name);
+        std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+        std::fs::write(path, "of the user").unwrap();
+    }
+    // What killed programs leave behind is removed.
+    let leftovers = ["run/.model.fieldrig.part/splats.ply", ".scene.spz.fieldrig.part/scene.spz"];
+    for name in leftovers {
+        let path = folder.join(name);
+        std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+        std::fs::write(path, "half a model").unwrap();
+    }
+    let resumed = run(folder, &["train", "data", "--resume", "run", "--steps", "6"]);
+    assert!(resumed.status.success() && folder.join("run/splats.ply").exists(), "{}", text(&resumed));
+    let exported = run(folder, &["export", "run", "--to", "spz", "--out", "scene.spz"]);
+    assert!(exported.status.success(), "{}", text(&exported));
+    for name in names {
+        assert_eq!(std::fs::read_to_string(folder.join(name)).unwrap(), "of the user", "{name}");
+    }
+    for name in leftovers {
+        assert!(!folder.join(name).parent().unwrap().exists(), "{name}");
     }
 }
 
@@ -182,15 +219,45 @@ fn results_are_private_unless_requested_otherwise() {
     dataset(&folder.join("data"));
     let mode = |path: &str| std::fs::metadata(folder.join(path)).unwrap().permissions().mode() & 0o777;
     for (out, flags, others) in [("private", &[][..], 0), ("public", &["--public-files"][..], 0o044)] {
-        // The usual umask, whatever that of the tests is.
-        let mut command = Command::new("sh");
-        command.args(["-c", "umask 022; exec \"$0\" \"$@\"", env!("CARGO_BIN_EXE_fieldrig")]);
-        command.args(["train", "data", "--steps", "2", "--max-splats", "200", "--out", out]).args(flags);
-        let trained = command.current_dir(folder).output().unwrap();
-        assert!(trained.status.success(), "{}", text(&trained));
+        let run_with_flags = |args: &[&str]| {
+            // The usual umask, whatever that of the tests is.
+            let mut command = Command::new("sh");
+            command.args(["-c", "umask 022; exec \"$0\" \"$@\"", env!("CARGO_BIN_EXE_fieldrig")]);
+            let output = command.args(args).args(flags).current_dir(folder).output().unwrap();
+            assert!(output.status.success(), "{}", text(&output));
+        };
+        run_with_flags(&["train", "data", "--steps", "2", "--max-splats", "200", "--out", out]);
         assert_eq!(mode(out) & 0o044, others);
         for file in ["splats.ply", "model.json", "training.ckpt", "report.json"] {
             assert_eq!(mode(&format!("{out}/{file}")) & 0o077, others, "{file}");
         }
+        let exported = format!("{out}.spz");
+        run_with_flags(&["export", out, "--to", "spz", "--out", &exported]);
+        assert_eq!(mode(&exported) & 0o077, others, "{exported}");
+        #[cfg(feature = "sim")]
+        {
+            crate::small_rig::write(folder, crate::small_rig::Pace::Lockstep);
+            let (recording, dataset) = (format!("{out}.mcap"), format!("{out}-dataset"));
+            run_with_flags(&["record", "rig.toml", "--sim", "--seconds", "6", "--out", &recording]);
+            run_with_flags(&["export", &recording, "--to", "nerfstudio", "--out", &dataset]);
+            assert_eq!((mode(&recording) & 0o077, mode(&dataset) & 0o044), (others, others));
+            let photo = std::fs::read_dir(folder.join(&dataset).join("images")).unwrap().next().unwrap().unwrap();
+            let photo = format!("{dataset}/images/{}", photo.file_name().to_string_lossy());
+            for file in [format!("{dataset}/transforms.json"), photo] {
+                assert_eq!(mode(&file) & 0o077, others, "{file}");
+            }
+        }
+    }
+}
+
+#[test]
+fn flags_of_other_commands_are_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    for command in ["view", "render", "eval", "devices", "doctor", "move"] {
+        let refused = run(folder.path(), &[command, "--public-files"]);
+        let printed = text(&refused);
+        assert!(refused.status.code() == Some(2) && printed.contains("'--public-files'"), "{command}: {printed}");
+        let help = text(&run(folder.path(), &[command, "--help"]));
+        assert!(help.contains("--json") && !help.contains("public-files"), "{command}: {help}");
     }
 }

@@ -94,3 +94,19 @@ fn check_resume_without_keyframes(folder: &Path, run: &Path) {
     let first = |list: &str| list.lines().find(|line| !line.starts_with('#')).map(str::to_owned);
     assert_ne!(first(&lists[0]), first(&lists[1]), "the damaged keyframe is no longer part of the run");
 }
+
+#[test]
+fn run_that_fails_before_its_first_keyframe_leaves_no_folder() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    small_rig::write(folder, Pace::Lockstep);
+    fs::write(folder.join("scan.mcap"), "of another program").expect("space");
+    for out in [&["--out", "run"][..], &[]] {
+        let args = [&["run", "rig.toml", "--steps", "1", "--record", "scan.mcap"][..], out].concat();
+        let output = fieldrig(folder, &args).output().expect("fieldrig starts");
+        let printed = String::from_utf8_lossy(&output.stderr);
+        assert!(output.status.code() == Some(1) && printed.contains("exists already"), "{printed}");
+        assert!(!folder.join("run").exists() && !folder.join("runs").exists(), "{printed}");
+    }
+    assert_eq!(fs::read(folder.join("scan.mcap")).expect("it is still there"), b"of another program");
+}

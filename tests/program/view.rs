@@ -312,14 +312,16 @@ fn non_model_paths_give_one_error() {
     std::fs::create_dir(folder.join("cut")).expect("the disk has space");
     write("cut/training.ckpt", b"a checkpoint");
     write("scan.mcap", b"\x89MCAP0\r\n");
-    write("new.spz", b"NGSP\x04\0\0\0and so on");
+    write("new.spz", b"NGSP\x05\0\0\0and so on");
+    write("scene.sog", b"PK\x03\x04");
     write("torn.ply", b"ply\n");
     let refused = |model: &str, code: i32, words: &[&str]| assert_fails_with(folder, &["view", model], code, words);
     refused("absent", 1, &["absent does not exist"]);
     refused("cut", 1, &["cut contains no model", "train --resume"]);
     refused("scan.mcap", 2, &["scan.mcap is a recording, not a model", "run RIG.toml --from scan.mcap"]);
     refused("data", 2, &["data is a dataset, not a model", "fieldrig train data"]);
-    refused("new.spz", 1, &["new.spz", "version 4", "expected 2 or 3"]);
+    refused("new.spz", 1, &["new.spz", "version 5", "expected 2 to 4"]);
+    refused("scene.sog", 1, &["scene.sog", "format .sog is not supported", "convert the file to .ply"]);
     refused("torn.ply", 1, &["torn.ply"]);
     refused("data/00.png", 2, &["00.png is not a file of splats"]);
     refused("http://127.0.0.1:7007/", 2, &["open it in a browser"]);

@@ -124,6 +124,8 @@ fn lost_terminal_stops_franka_motion_and_kill_is_a_reflex() {
     killed.child.wait().expect("our own child");
     let (code, printed) = nudge(&[]);
     assert!(code == Some(1) && printed.contains("stopped by a reflex"), "{printed}");
+    let is_warning = |line: &&str| line.contains("WARN") && line.contains("stopped by a reflex");
+    assert_eq!(printed.lines().filter(is_warning).count(), 1, "{printed}");
     let (code, printed) = nudge(&["--recover"]);
     assert_eq!(code, Some(0), "{printed}");
 }

@@ -9,6 +9,7 @@
 use crate::checkpoint::{Checkpoint, PendingCheckpoint};
 use crate::edits::{Edits, PendingFloaters};
 use crate::gpu::{Gpu, PassTiming};
+use crate::initial_points::InitialPoints;
 use crate::model_chunks::PendingChunks;
 use crate::model_metadata::{METADATA_FILE, read_metadata};
 use crate::model_options::{AlignTiming, CommonOptions};
@@ -409,6 +410,10 @@ impl<M: Recalibrate + 'static> Method for Aligned<M> {
         self.model.remove(camera, stamp)
     }
 
+    fn set_initial_points(&mut self, points: &Arc<InitialPoints>) -> bool {
+        self.model.set_initial_points(points)
+    }
+
     fn step(&mut self, n: u64) -> Result<u64, Error> {
         if self.precedes_training() {
             self.begin_alignment();
@@ -544,7 +549,7 @@ impl<M: Recalibrate + 'static> Method for Aligned<M> {
         let invalid_file =
             |error: serde_json::Error| Error::SplatFile { path: path.clone(), reason: error.to_string() };
         let bytes =
-            files::read(&path, files::MAX_TEXT_BYTES).map_err(|source| Error::Read { path: path.clone(), source })?;
+            files::read(&path, files::Budget::TEXT).map_err(|source| Error::Read { path: path.clone(), source })?;
         let mut metadata: serde_json::Map<String, serde_json::Value> =
             serde_json::from_slice(&bytes).map_err(invalid_file)?;
         metadata.insert(METADATA_KEY.to_owned(), serde_json::to_value(alignment).map_err(invalid_file)?);

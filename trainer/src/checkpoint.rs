@@ -100,7 +100,7 @@ impl Checkpoint {
     /// Reads a file and verifies its checksum.
     pub fn read(path: &Path) -> Result<Self, Error> {
         let bytes =
-            files::read(path, files::NO_LIMIT).map_err(|source| Error::Read { path: path.to_owned(), source })?;
+            files::read(path, files::Budget::PLAIN).map_err(|source| Error::Read { path: path.to_owned(), source })?;
         Self::from_bytes(&bytes).map_err(|reason| Error::Checkpoint { path: path.to_owned(), reason })
     }
 
@@ -217,7 +217,7 @@ mod tests {
     fn written_file_round_trips_and_replaces_the_previous() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("training.ckpt");
-        std::fs::write(folder.path().join("training.ckpt.part"), b"of a run that was killed").unwrap();
+        std::fs::write(files::partial::path_of(&path), b"of a run that was killed").unwrap();
         for seconds in [0.0, 1.5] {
             let written = Checkpoint { seconds, ..checkpoint() };
             written.write(&path).unwrap();

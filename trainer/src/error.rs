@@ -38,7 +38,7 @@ pub enum Error {
     DeviceLost,
     /// The GPU has no memory left for a buffer, or for commands; for commands, `label` is empty and `bytes` is 0.
     #[error(
-        "the GPU ran out of memory{}; close other programs that use it, or lower --max-splats, --max-bytes or the image size",
+        "the GPU ran out of memory{}; close other programs that use it, use smaller images, or train a smaller model (--max-splats or --max-bytes of `fieldrig train` and `run`)",
         buffer_suffix(label, *bytes)
     )]
     OutOfMemory {
@@ -56,7 +56,7 @@ pub enum Error {
     Internal(String),
     /// A buffer exceeds the adapter's limit.
     #[error(
-        "buffer {label}: {bytes} bytes are more than this GPU can bind ({limit_bytes} bytes); lower --max-splats, --max-bytes or the image size"
+        "buffer {label}: {bytes} bytes are more than this GPU can bind ({limit_bytes} bytes); use smaller images, or train a smaller model (--max-splats or --max-bytes of `fieldrig train` and `run`)"
     )]
     BufferTooLarge {
         /// Name of the buffer.
@@ -165,12 +165,12 @@ pub enum Error {
         /// The file.
         path: PathBuf,
         /// Cause.
-        source: candle_core::Error,
+        source: Box<candle_core::Error>,
     },
     /// The LPIPS network failed.
     #[cfg(feature = "lpips")]
     #[error("LPIPS network failed")]
-    LpipsNetwork(#[source] candle_core::Error),
+    LpipsNetwork(#[source] Box<candle_core::Error>),
     /// A splat file or the metadata of a model is invalid.
     #[error("cannot parse {path:?}: {reason}")]
     SplatFile {
@@ -252,6 +252,12 @@ pub enum Error {
     /// A model has the maximum number of edits.
     #[error("a model has at most {} edits; undo one first", crate::edits::MAX_EDITS)]
     TooManyEdits,
+    /// An edit has values that kernels cannot compute with.
+    #[error("invalid edit: {reason}")]
+    InvalidEdit {
+        /// Values found and expected.
+        reason: String,
+    },
     /// A model has no edit that could be undone.
     #[error("there is nothing to undo")]
     NothingToUndo,

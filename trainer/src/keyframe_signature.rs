@@ -2,8 +2,8 @@
 
 use crate::Error;
 use keyframe::{DepthMap, Keyframe, Split};
-use kinematics::{Stamp, Transform};
-use nalgebra::{Quaternion, Translation3, UnitQuaternion};
+use kinematics::Stamp;
+use kinematics::transform::{from_xyz_xyzw, to_xyz_xyzw};
 use serde::{Deserialize, Serialize};
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -24,8 +24,6 @@ pub(crate) struct KeyframeSignature {
 
 impl KeyframeSignature {
     pub(crate) fn of(keyframe: &Keyframe) -> Self {
-        let pose = &keyframe.world_from_camera;
-        let (translation, rotation) = (pose.translation.vector, pose.rotation.coords);
         Self {
             camera: keyframe.camera.to_string(),
             stamp_nanos: keyframe.stamp.0,
@@ -33,24 +31,13 @@ impl KeyframeSignature {
             depth_size_px: keyframe.depth.as_ref().map(|depth| depth.size_px),
             focal_px: keyframe.focal_px,
             principal_px: keyframe.principal_px,
-            world_from_camera: [
-                translation.x,
-                translation.y,
-                translation.z,
-                rotation.x,
-                rotation.y,
-                rotation.z,
-                rotation.w,
-            ],
+            world_from_camera: to_xyz_xyzw(&keyframe.world_from_camera),
         }
     }
 
     /// A keyframe without pixels that stands for the recorded one.
     fn placeholder(&self) -> Keyframe {
-        let [x, y, z, i, j, k, w] = self.world_from_camera;
-        // Not normalized again, so that the pose is bit-identical to that of this signature.
-        let rotation = UnitQuaternion::new_unchecked(Quaternion::new(w, i, j, k));
-        let world_from_camera = Transform::from_parts(Translation3::new(x, y, z), rotation);
+        let world_from_camera = from_xyz_xyzw(self.world_from_camera);
         let depth = self.depth_size_px.map(|size_px| DepthMap {
             size_px,
             focal_px: self.focal_px,

@@ -18,6 +18,7 @@ mod error;
 pub mod eval;
 mod failed_model;
 pub mod gpu;
+mod initial_points;
 mod keyframe_signature;
 pub mod loss;
 #[cfg(test)]
@@ -54,6 +55,7 @@ pub use bounds::Bounds;
 pub use edits::Edits;
 pub use error::Error;
 pub use failed_model::FailedModel;
+pub use initial_points::InitialPoints;
 pub use method::{Method, Progress};
 pub use model_chunks::{ChunkData, ChunkLayout, MAX_MESH_COUNT, ModelChunk, ModelChunks, PendingChunks};
 pub use model_options::{AlignTiming, CommonOptions, MethodOptions, ModelOptions};

@@ -4,6 +4,7 @@ use crate::bounds::Bounds;
 use crate::checkpoint::PendingCheckpoint;
 use crate::edits::{Edits, PendingFloaters};
 use crate::gpu::PassTiming;
+use crate::initial_points::InitialPoints;
 use crate::model_chunks::PendingChunks;
 use crate::{Error, Packing, Picture, QueuedPicture, RenderRequest, Rendered};
 use calibration::{Alignment, CalibratedCamera, CameraCorrection, TrialReport};
@@ -46,6 +47,12 @@ pub trait Method {
     /// Removes the keyframe with this camera and stamp, if there is one. The scene learned from it stays, but
     /// resuming from a later checkpoint must not require the keyframe.
     fn remove(&mut self, camera: &str, stamp: Stamp) -> Result<(), Error>;
+    /// Sets points on the surfaces of the scene, from which the model starts if no keyframe has depth. Call before the
+    /// first step, and again after resuming, because checkpoints do not contain the points. Returns false if the method
+    /// does not use them.
+    fn set_initial_points(&mut self, _points: &Arc<InitialPoints>) -> bool {
+        false
+    }
     /// Queues up to `n` optimizer updates, but at most 20 ms of GPU work (4 ms while watched, [`Method::set_watched`]).
     /// Returns the number of queued updates. At most one submit runs and one is queued.
     ///

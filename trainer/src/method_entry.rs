@@ -63,6 +63,8 @@ pub struct SingleFile {
     pub description: &'static str,
     /// Supported extensions.
     pub extensions: &'static [&'static str],
+    /// Extensions of such files in other formats. The error when reading one names its format.
+    pub unsupported_extensions: &'static [&'static str],
 }
 
 /// A format of other programs to which saved models can be exported.

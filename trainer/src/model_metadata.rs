@@ -67,7 +67,7 @@ impl ModelMetadata {
 pub(crate) fn read_metadata(folder: &Path) -> Result<ModelMetadata, Error> {
     let path = folder.join(METADATA_FILE);
     let invalid_file = |reason: String| Error::SplatFile { path: path.clone(), reason };
-    let bytes = match files::read(&path, files::MAX_TEXT_BYTES) {
+    let bytes = match files::read(&path, files::Budget::TEXT) {
         Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(ModelMetadata::default()),
         read => read.map_err(|error| invalid_file(error.to_string()))?,
     };

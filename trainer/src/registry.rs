@@ -57,7 +57,7 @@ impl ModelKind {
         let is_complete = |kind: &Self| kind.0.files.last().is_some_and(|file| model.join(file).is_file());
         let by_files = || Self::ALL.iter().copied().find(is_complete);
         let path = model.join(METADATA_FILE);
-        let bytes = match files::read(&path, files::MAX_TEXT_BYTES) {
+        let bytes = match files::read(&path, files::Budget::TEXT) {
             Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(by_files()),
             read => read.map_err(|source| Error::Read { path: path.clone(), source })?,
         };
@@ -66,11 +66,16 @@ impl ModelKind {
         Ok(metadata.method.as_deref().and_then(Self::from_name).or_else(by_files))
     }
 
-    /// The method that saves single files with the extension of this file.
+    /// The method whose models are single files with the extension of this file, including extensions that are not
+    /// supported.
     pub fn of_single_file(file: &Path) -> Option<Self> {
         let extension = file.extension()?.to_str()?.to_ascii_lowercase();
-        let has_extension =
-            |kind: &Self| kind.0.single_file.is_some_and(|single| single.extensions.contains(&extension.as_str()));
+        let has_extension = |kind: &Self| {
+            let single_file = kind.0.single_file;
+            let extensions =
+                single_file.into_iter().flat_map(|single| [single.extensions, single.unsupported_extensions]);
+            extensions.flatten().any(|known| *known == extension)
+        };
         Self::ALL.iter().copied().find(has_extension)
     }
 

@@ -48,7 +48,7 @@ impl Certificate {
             file: file.to_owned(),
             reason: error.to_string(),
         };
-        let read = |file: &Path| files::read(file, files::MAX_TEXT_BYTES).map_err(|error| failed(file, &error));
+        let read = |file: &Path| files::read(file, files::Budget::TEXT).map_err(|error| failed(file, &error));
         let chain = CertificateDer::pem_slice_iter(&read(certificate_file)?)
             .collect::<Result<Vec<_>, _>>()
             .map_err(|error| failed(certificate_file, &error))?;

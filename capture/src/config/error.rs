@@ -59,6 +59,16 @@ pub enum ConfigError {
         /// The allowed values.
         allowed: String,
     },
+    /// A camera info file of ROS cannot be used.
+    #[error("{at}: {key}: {reason}")]
+    CameraInfo {
+        /// Where the value is set.
+        at: SourceLocation,
+        /// Dotted path of the key.
+        key: String,
+        /// The file, and why it cannot be used.
+        reason: String,
+    },
     /// The rig file has several problems.
     #[error(
         "{first}{}{}",

@@ -213,7 +213,7 @@ fn rounded(limit: f64) -> f64 {
 }
 
 /// Converts integers and finite floats.
-fn number(value: &Value) -> Option<f64> {
+pub(super) fn number(value: &Value) -> Option<f64> {
     #[expect(clippy::cast_precision_loss, reason = "numbers of a rig file stay far below 2^53")]
     let number = value.as_float().or_else(|| value.as_integer().map(|whole| whole as f64))?;
     number.is_finite().then_some(number)

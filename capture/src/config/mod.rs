@@ -6,6 +6,7 @@
 mod arm;
 mod base;
 mod camera;
+mod camera_info_file;
 mod can;
 mod error;
 mod join;
@@ -74,7 +75,8 @@ impl Rig {
         self.base.driver != BaseDriver::Fixed
     }
 
-    /// Reads and checks a rig file and the robot description that it names. Paths in the rig become absolute.
+    /// Reads and checks a rig file, and the robot description and camera info files that it names. Paths in the rig become
+    /// absolute.
     ///
     /// # Errors
     ///
@@ -85,8 +87,8 @@ impl Rig {
         let file =
             path.file_name().map_or_else(|| path.display().to_string(), |name| name.to_string_lossy().into_owned());
         let folder = path.parent().unwrap_or(Path::new("")).to_owned();
-        let mut rig =
-            rig_file::read(&file, &text, overrides, |urdf| read_file("the robot description", &folder.join(urdf)))?;
+        let read_urdf = |urdf: &str| read_file("the robot description", &folder.join(urdf));
+        let mut rig = rig_file::read(&file, &text, overrides, Some(&folder), read_urdf)?;
         if let Some(motion) = rig.arm.motion.as_mut().filter(|motion| !motion.odrive_endpoints.is_empty()) {
             // An absolute path stays valid in the effective rig file, which is in another folder.
             let path = folder.join(&motion.odrive_endpoints);
@@ -120,7 +122,7 @@ impl Rig {
     ///
     /// As for [`Rig::load`], except for errors of reading files.
     pub fn parse(file: &str, text: &str, urdf_text: &str, overrides: &[Override]) -> Result<Self, ConfigError> {
-        rig_file::read(file, text, overrides, |_| Ok(urdf_text.to_owned()))
+        rig_file::read(file, text, overrides, None, |_| Ok(urdf_text.to_owned()))
     }
 
     /// The effective rig file with every key, from which the same rig can be read. It expects the robot description

@@ -2,20 +2,23 @@
 
 use super::key::entry;
 use super::section::{ParseContext, Section};
-use super::{ConfigError, Override, Rig, arm, base, camera, scanner, sim};
+use super::{ConfigError, Override, Rig, arm, base, camera, camera_info_file, scanner, sim};
+use std::path::Path;
 use toml::{Table, Value};
 
 /// Robot description of a rig without an arm, if the rig file names none.
 const EMPTY_URDF: &str = r#"<robot name="none"><link name="base"/></robot>"#;
 
-/// Reads a rig; `read_urdf` returns the robot description for the path in the file.
+/// Reads a rig; `read_urdf` returns the robot description for the path in the file. Lens parameters may be in other files
+/// only if the folder of the rig file is given.
 pub(super) fn read(
     file: &str,
     text: &str,
     overrides: &[Override],
+    folder: Option<&Path>,
     read_urdf: impl FnOnce(&str) -> Result<String, ConfigError>,
 ) -> Result<Rig, ConfigError> {
-    let (rig, context) = keys(file, text, overrides)?;
+    let (rig, context) = keys(file, text, overrides, folder)?;
     if let Some(problem) = context.into_problem() {
         return Err(problem);
     }
@@ -31,6 +34,7 @@ pub(super) fn keys(
     file: &str,
     text: &str,
     overrides: &[Override],
+    folder: Option<&Path>,
 ) -> Result<(Option<(Rig, String)>, ParseContext), ConfigError> {
     let context = ParseContext::new(file, text, overrides.iter().map(|flag| flag.key.to_owned()).collect())?;
     let syntax =
@@ -38,6 +42,9 @@ pub(super) fn keys(
     let mut table: Table = toml::from_str(text).map_err(syntax)?;
     for flag in overrides {
         set(&mut table, flag.key, flag.value.clone());
+    }
+    if let Some(folder) = folder {
+        camera_info_file::insert_contents(&mut table, folder, &context)?;
     }
     let root = Section::root(&context, table);
     Ok((rig(root), context))

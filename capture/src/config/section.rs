@@ -4,6 +4,7 @@
 
 use super::error::{ConfigError, SourceLocation};
 use crate::nearest_name;
+use files::Budget;
 use std::borrow::Cow;
 use std::cell::{Cell, RefCell};
 use std::collections::{BTreeMap, BTreeSet};
@@ -12,10 +13,6 @@ use toml::{Table, Value};
 
 /// Maximum number of listed problems; further ones are only counted.
 const MAX_PROBLEMS: usize = 50;
-
-/// Maximum number of tables with free names: cameras, scanners, motors or tags. More are probably an error of the program
-/// that wrote the file.
-const MAX_TABLES: usize = 1000;
 
 /// State shared by all sections while a rig file is read.
 #[derive(Debug)]
@@ -91,7 +88,8 @@ impl ParseContext {
         }
     }
 
-    fn location(&self, key: &str) -> SourceLocation {
+    /// Where the value of a key, a dotted path, comes from.
+    pub(super) fn location(&self, key: &str) -> SourceLocation {
         // A flag may replace a whole table, and keys inside an inline table are on its line.
         let mut path = key;
         loop {
@@ -176,13 +174,14 @@ impl<'a> Section<'a> {
         }
     }
 
-    /// The tables inside this one that have free names, with their names. More than [`MAX_TABLES`] are a problem.
+    /// The tables inside this one that have free names, with their names. More than [`Budget::RIG_TABLES`] are a problem:
+    /// probably an error of the program that wrote the file.
     pub(super) fn named_sections(&mut self, key: &'static str) -> Vec<(String, Self)> {
         let Some(mut parent) = self.optional_section(key) else { return Vec::new() };
-        let n = parent.table.len();
-        if n > MAX_TABLES {
+        let (n, budget) = (parent.table.len(), Budget::RIG_TABLES);
+        if budget.check_elements(n as u64).is_err() {
             let got = Value::String(format!("{n} tables"));
-            self.invalid::<()>(key, &got, &format!("at most {MAX_TABLES} tables"));
+            self.invalid::<()>(key, &got, &format!("at most {} tables", budget.max_elements));
             parent.table.clear();
         }
         let mut sections = Vec::new();

@@ -318,7 +318,7 @@ fn documentation_lists_exactly_the_existing_keys() {
     let page = include_str!("../../../docs/reference/rig.md");
     let documented: BTreeMap<String, &str> =
         page.lines().filter_map(|line| Some((line.strip_prefix("| `")?.split_once('`')?.0.to_owned(), line))).collect();
-    let (_, context) = rig_file::keys("rig.toml", &full(), &[]).expect("TOML");
+    let (_, context) = rig_file::keys("rig.toml", &full(), &[], None).expect("TOML");
     let known = context.accessed();
     let listed: BTreeSet<String> = documented.keys().cloned().collect();
     assert_eq!(listed.difference(&known).collect::<Vec<_>>(), Vec::<&String>::new(), "documented, but not read");

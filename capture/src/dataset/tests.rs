@@ -87,6 +87,49 @@ fn scaling_averages_areas_and_propagates_masks() {
 }
 
 #[test]
+fn large_photos_are_decoded_few_at_a_time() {
+    assert_eq!(n_at_once([11_648, 8736], MAX_PX_AT_ONCE, 2), Some(1));
+    assert_eq!(n_at_once([8192, 8192], MAX_PX_AT_ONCE, 16), Some(2));
+    assert_eq!(n_at_once([8192, 8192], MAX_PX_AT_ONCE, 2), None, "one per thread");
+    assert_eq!(n_at_once([1920, 1080], MAX_PX_AT_ONCE, 64), None);
+    assert_eq!(n_at_once([65_535, 65_535], MAX_PX_AT_ONCE, 1), Some(1));
+    let folder = folder_of(20, &json!({}));
+    let dataset = drivers::dataset::read(folder.path()).unwrap();
+    let all = load_at(folder.path(), 0.5).unwrap();
+    let one_by_one = load_few_at_once(&dataset, None, 0.5, 1, &|_| ()).unwrap();
+    assert_eq!(one_by_one.names, all.names);
+    let key = |keyframe: &Arc<Keyframe>| (keyframe.stamp, keyframe.split, keyframe.rgba_srgb.clone());
+    assert!(one_by_one.keyframes.iter().map(key).eq(all.keyframes.iter().map(key)));
+}
+
+#[test]
+fn photos_are_undistorted_and_scaled_without_a_copy() {
+    let folder = folder_of(1, &json!({ "camera_model": "OPENCV_FISHEYE", "k1": 2.0 }));
+    let dataset = drivers::dataset::read(folder.path()).unwrap();
+    let (lens, image) = (&dataset.images[0].intrinsics, dataset.images[0].load().unwrap());
+    let undistorted = Undistortion::new(lens).apply_rgba(&image.rgba_srgb).unwrap();
+    assert_ne!(undistorted, image.rgba_srgb);
+    for to_px in [[20, 15], [37, 48], [64, 48]] {
+        let expected = downscale::rgba(undistorted.clone(), [64, 48], to_px);
+        let scaled = LensMaps::of(lens).scaled_color(image.rgba_srgb.clone(), [64, 48], to_px).unwrap();
+        assert_eq!(scaled, expected, "{to_px:?}");
+    }
+}
+
+#[test]
+fn photos_that_exceed_the_memory_are_refused_with_a_scale() {
+    let folder = folder_of(10, &json!({}));
+    let dataset = drivers::dataset::read(folder.path()).unwrap();
+    let n_bytes = 10 * 4 * 64 * 48;
+    check_memory(&dataset, 1.0, n_bytes).unwrap();
+    check_memory(&dataset, 0.5, n_bytes / 4).unwrap();
+    let message = |available_bytes| check_memory(&dataset, 1.0, available_bytes).unwrap_err().to_string();
+    let text = message(n_bytes / 4);
+    assert!(text.contains("10 photos take") && text.contains("scale them to 0.5 or less (--scale of"), "{text}");
+    assert!(message(10).ends_with("use fewer photos"));
+}
+
+#[test]
 fn truncated_photos_are_skipped_and_named() {
     let folder = folder_of(10, &json!({}));
     let truncate = |name: &str| {
@@ -100,9 +143,9 @@ fn truncated_photos_are_skipped_and_named() {
     assert!(loaded.data_losses[0].contains("1 image cannot be used") && loaded.data_losses[0].contains("03.png"));
     // The other photos keep their splits.
     assert_eq!(loaded.keyframes[7].split, Split::Test);
-    (0..10).for_each(|ix| truncate(&format!("{ix:02}.png")));
+    (0..10).filter(|ix| *ix != 3).for_each(|ix| truncate(&format!("{ix:02}.png")));
     let text = load_at(folder.path(), 1.0).unwrap_err().to_string();
-    assert!(text.contains("no photo can be used"), "{text}");
+    assert!(text.contains("no photo can be used") && text.ends_with("; and 7 more"), "{text}");
 }
 
 #[test]

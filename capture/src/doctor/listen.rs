@@ -1,10 +1,11 @@
 //! Measures rates, latencies and losses of a rig's devices, with the drivers of `run`. Nothing is moved.
 
-use super::Finding;
+use super::{Finding, udp};
 use crate::config::{ArmDriver, BaseDriver, Rig};
 use crate::open::{self, Devices, Opened};
 use crate::{Join, JoinEvent, Rejection, Result, Stop};
-use drivers::{Sample, clock};
+use drivers::udp::DatagramMonitor;
+use drivers::{Error, Sample, clock};
 use kinematics::Stamp;
 use kinematics::quantile::{Rank, quantile};
 use serde::Serialize;
@@ -111,7 +112,7 @@ impl Track {
 /// # Errors
 /// A device cannot be opened.
 pub fn listen(rig: &Rig, secs: f64, stop: &Stop) -> Result<ListenResult> {
-    let Opened { rig, mut source, .. } = open::rig(rig.clone(), Devices::Real)?;
+    let (Opened { rig, mut source, .. }, monitors) = open::rig_with_monitors(rig.clone(), Devices::Real)?;
     let mut join = Join::new(&rig)?;
     let mut tracks: BTreeMap<String, Track> = BTreeMap::new();
     let mut findings = Vec::new();
@@ -121,7 +122,7 @@ pub fn listen(rig: &Rig, secs: f64, stop: &Stop) -> Result<ListenResult> {
             Ok(Some(sample)) => sample,
             Ok(None) => break,
             Err(error) => {
-                findings.push(Finding::fail("devices", format!("{error}"), "check the device and its cable"));
+                findings.push(Finding::fail("devices", error.to_string(), remedy(&error, &monitors)));
                 break;
             }
         };
@@ -150,7 +151,9 @@ pub fn listen(rig: &Rig, secs: f64, stop: &Stop) -> Result<ListenResult> {
     // A simulation has its own clock.
     let is_simulated = open::is_any_simulated(&rig);
     let expected = expected(&rig);
-    findings.extend(missing(&rig, &expected, &tracks));
+    findings.extend(missing(&rig, &expected, &tracks, &monitors));
+    let of_datagrams = |monitor: &DatagramMonitor| udp::datagrams(monitor, tracks.contains_key(monitor.device()));
+    findings.extend(monitors.iter().filter_map(of_datagrams));
     let devices: Vec<_> = tracks
         .into_iter()
         .map(|(device, track)| {
@@ -199,15 +202,45 @@ fn expected(rig: &Rig) -> BTreeMap<String, Option<f64>> {
     expected
 }
 
-fn missing(rig: &Rig, expected: &BTreeMap<String, Option<f64>>, tracks: &BTreeMap<String, Track>) -> Vec<Finding> {
-    let silent = expected.keys().filter(|device| !tracks.contains_key(*device));
-    let remedy = |device: &str| match rig.base.driver {
-        BaseDriver::Tags if device == "base" => {
-            "no image gave its pose: check base.tag_family, and the sizes and poses of the tags"
-        }
-        _ => "check it and its cable",
-    };
-    silent.map(|device| Finding::fail("silent", format!("no data from {device}"), remedy(device))).collect()
+/// The device without data, if an error of a source is about one.
+fn silent_device(error: &Error) -> Option<String> {
+    match error {
+        Error::NoJoints { .. } => Some("arm".to_owned()),
+        Error::NoBasePose { .. } => Some("base".to_owned()),
+        Error::NoScan { scanner, .. } => Some(format!("range scanner {scanner:?}")),
+        _ => None,
+    }
+}
+
+/// What to do about an error of a device.
+fn remedy(error: &Error, monitors: &[DatagramMonitor]) -> &'static str {
+    let device = silent_device(error);
+    match monitors.iter().any(|monitor| Some(monitor.device()) == device.as_deref()) {
+        true => "check its sender: docs/reference/udp.md describes the format",
+        false => "check the device and its cable",
+    }
+}
+
+/// The devices that sent nothing. Devices whose datagrams cannot be used have a finding of their own.
+fn missing(
+    rig: &Rig,
+    expected: &BTreeMap<String, Option<f64>>,
+    tracks: &BTreeMap<String, Track>,
+    monitors: &[DatagramMonitor],
+) -> Vec<Finding> {
+    let mut findings = Vec::new();
+    for device in expected.keys().filter(|device| !tracks.contains_key(*device)) {
+        let remedy = match monitors.iter().find(|monitor| monitor.device() == device) {
+            Some(monitor) if monitor.counts().n_received > 0 => continue,
+            Some(monitor) => format!("start its sender, and let it send to {}", monitor.address()),
+            None if rig.base.driver == BaseDriver::Tags && device == "base" => {
+                "no image gave its pose: check base.tag_family, and the sizes and poses of the tags".to_owned()
+            }
+            None => "check it and its cable".to_owned(),
+        };
+        findings.push(Finding::fail("silent", format!("no data from {device}"), remedy));
+    }
+    findings
 }
 
 /// Checks rate and losses of a device. Returns a finding if there is a problem.

@@ -5,7 +5,7 @@ use crate::config::{Override, Rig};
 use crate::open;
 use drivers::{BasePose, Image, PixelFormat, Sample, TruthImage};
 use keyframe::{Keyframe, KeyframeList, Split, list_text};
-use kinematics::{Chain, JointState, Stamp, Transform};
+use kinematics::{Chain, JointState, Stamp, Transform, transform};
 use std::f64::consts::TAU;
 use std::path::Path;
 use std::sync::Arc;
@@ -134,10 +134,7 @@ fn join(rig: &Rig) -> Join {
 /// Differences between two lists of keyframes, exact to the last bit.
 fn differences(a: &[Arc<Keyframe>], b: &[Arc<Keyframe>]) -> Vec<String> {
     let bits = |keyframe: &Keyframe| {
-        let pose = |pose: &Transform| {
-            let numbers = pose.translation.vector.iter().chain(pose.rotation.coords.iter());
-            numbers.map(|number| number.to_bits()).collect::<Vec<_>>()
-        };
+        let pose = |pose: &Transform| transform::to_xyz_xyzw(pose).map(f64::to_bits);
         let twist = keyframe.twist.map(|twist| {
             let numbers = twist.linear_m_s.iter().chain(twist.angular_rad_s.iter());
             numbers.map(|number| number.to_bits()).collect::<Vec<_>>()

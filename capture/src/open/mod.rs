@@ -22,6 +22,7 @@ use crate::error::{Context, Error};
 use crate::notes::Notes;
 use crate::stamp_clock::StampClock;
 use drivers::recording::{RIG_FILE, Recorder, Recording, RecordingMetadata, URDF_FILE};
+use drivers::udp::DatagramMonitor;
 use drivers::{Live, Playback, Repeating, Sample, Source};
 use keyframe::bail;
 use kinematics::Chain;
@@ -30,7 +31,7 @@ use std::sync::{Arc, OnceLock};
 use tags::TagBaseSource;
 
 /// Hint in error messages about devices that cannot be opened.
-const SIM_HINT: &str = "--sim replaces every device by its simulated twin";
+const SIM_HINT: &str = "`fieldrig run --sim` replaces every device by its simulated twin";
 
 /// The port of a Franka controller.
 pub const FCI_PORT: u16 = 1337;
@@ -95,7 +96,12 @@ impl Opened {
 ///
 /// If a device cannot be opened, a driver is not part of this build, or the rig file lacks a setting that a driver
 /// needs.
-pub fn rig(mut rig: Rig, devices: Devices) -> crate::Result<Opened> {
+pub fn rig(rig: Rig, devices: Devices) -> crate::Result<Opened> {
+    rig_with_monitors(rig, devices).map(|(opened, _)| opened)
+}
+
+/// Like [`rig()`], with monitors of the devices that receive datagrams.
+pub(crate) fn rig_with_monitors(mut rig: Rig, devices: Devices) -> crate::Result<(Opened, Vec<DatagramMonitor>)> {
     if devices == Devices::Sim {
         use_simulated_devices(&mut rig);
     }
@@ -107,7 +113,8 @@ pub fn rig(mut rig: Rig, devices: Devices) -> crate::Result<Opened> {
     if devices == Devices::Sim {
         check_intrinsics(&rig)?;
     }
-    let real = real::open(&mut rig).map_err(|error| Error::Failed(format!("{error:#}; {SIM_HINT}")))?;
+    let opened = real::open(&mut rig).map_err(|error| Error::Failed(format!("{error:#}; {SIM_HINT}")));
+    let (real, monitors) = opened?;
     let (source, stamp_clock): (Box<dyn Source>, _) = match is_any_simulated(&rig) {
         true => simulate(&rig, real)?,
         false => (Box::new(Live::new(real)?), StampClock::Computer),
@@ -116,7 +123,7 @@ pub fn rig(mut rig: Rig, devices: Devices) -> crate::Result<Opened> {
         BaseDriver::Tags => Box::new(TagBaseSource::new(&rig, source)?),
         _ => source,
     };
-    Ok(Opened { rig, source, damage: Arc::default(), stamp_clock })
+    Ok((Opened { rig, source, damage: Arc::default(), stamp_clock }, monitors))
 }
 
 /// Replaces every device by its simulated twin.
@@ -198,7 +205,7 @@ fn stored_rig(path: &Path, recording: &Recording, overrides: &[Override]) -> cra
     let text = |name| {
         let bytes = recording.attachment(name).with_context(|| {
             format!(
-                "the recording {path:?} contains no {name}, which fieldrig stores in it; if another program removed it, give the rig file with --rig"
+                "the recording {path:?} contains no {name}, which fieldrig stores in it; if another program removed it, give the rig file with --rig to `fieldrig train`, `eval`, `export` or `calibrate`"
             )
         })?;
         std::str::from_utf8(bytes).with_context(|| format!("the recording {path:?}: {name} is not text"))

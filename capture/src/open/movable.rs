@@ -54,7 +54,8 @@ pub fn movable(rig: &Rig, devices: Devices, camera: &str) -> crate::Result<Movab
     let driver = std::mem::replace(&mut rig.arm.driver, ArmDriver::None);
     let opened = real::open(&mut rig);
     rig.arm.driver = driver;
-    let Some(camera) = opened?.cameras.into_iter().next() else {
+    let (opened, _) = opened?;
+    let Some(camera) = opened.cameras.into_iter().next() else {
         bail!("camera {camera:?} was not opened");
     };
     let arm = real::movable_arm(&rig)?;

@@ -13,7 +13,7 @@ use drivers::franka::{self, FrankaArm, MovableFrankaArm};
 #[cfg(target_os = "linux")]
 use drivers::motion::MotionConfig;
 use drivers::motion::{MotionLimits, MovableArm};
-use drivers::udp::{UdpArm, UdpBase, UdpScanner};
+use drivers::udp::{DatagramMonitor, UdpArm, UdpBase, UdpScanner};
 #[cfg(target_os = "linux")]
 use drivers::v4l2::{Config, Settings, V4l2Camera, V4l2Format};
 use drivers::{Arm, Base, Devices, RangeScanner};
@@ -24,9 +24,14 @@ use std::time::Duration;
 /// Default address for receiving joint states: this computer only.
 const DEFAULT_ARM_ADDRESS: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 7011);
 
-/// Opens all real devices of a rig, possibly none. Fills in calibration that is stored in a camera.
-pub(super) fn open(rig: &mut Rig) -> crate::Result<Devices> {
-    let mut devices = Devices::default();
+/// Error for an arm that this program cannot move.
+const READ_ONLY: &str =
+    "arms with this driver can only be read; to move the arm, set arm.driver = \"can\" or \"franka\"";
+
+/// Opens all real devices of a rig, possibly none, with monitors of those that receive datagrams. Fills in calibration that
+/// is stored in a camera.
+pub(super) fn open(rig: &mut Rig) -> crate::Result<(Devices, Vec<DatagramMonitor>)> {
+    let (mut devices, mut monitors) = (Devices::default(), Vec::new());
     for camera in &mut rig.cameras {
         match camera.driver {
             CameraDriver::V4l2 => devices.cameras.extend(v4l2_cameras(camera)?),
@@ -39,19 +44,25 @@ pub(super) fn open(rig: &mut Rig) -> crate::Result<Devices> {
         ArmDriver::None | ArmDriver::Sim => None,
         ArmDriver::Can => Some(can_arm(rig)?),
         ArmDriver::Franka => Some(franka_arm(rig)?),
-        ArmDriver::Udp => Some(udp_arm(rig)?),
+        ArmDriver::Udp => {
+            let arm = udp_arm(rig)?;
+            monitors.push(arm.monitor());
+            Some(Box::new(arm) as Box<dyn Arm>)
+        }
     };
     if rig.base.driver == BaseDriver::Udp {
         let base = UdpBase::open(rig.base.address, [rig.base.max_sigma_m, rig.base.max_sigma_rad])?;
         log::info!("base: listening on {}", base.address());
+        monitors.push(base.monitor());
         devices.base = Some(Box::new(base) as Box<dyn Base>);
     }
     for scanner in rig.scanners.iter().filter(|scanner| scanner.driver == ScannerDriver::Udp) {
         let open = UdpScanner::open(&scanner.name, scanner.address)?;
         log::info!("range scanner {:?}: listening on {}", scanner.name, open.address());
+        monitors.push(open.monitor());
         devices.scanners.push(Box::new(open) as Box<dyn RangeScanner>);
     }
-    Ok(devices)
+    Ok((devices, monitors))
 }
 
 /// Opens the arm for motion: enables it and holds its position. Positions of the returned arm do not include
@@ -68,7 +79,7 @@ pub fn movable_arm(rig: &Rig) -> crate::Result<Box<dyn MovableArm>> {
     match rig.arm.driver {
         ArmDriver::Can => movable_can_arm(rig, motion),
         ArmDriver::Franka => movable_franka_arm(rig, motion),
-        _ => bail!("arms with this driver can only be read"),
+        _ => bail!("{READ_ONLY}"),
     }
 }
 
@@ -84,7 +95,7 @@ pub fn check_motion(rig: &Rig) -> crate::Result<()> {
         ArmDriver::Can => Ok(MovableCanArm::check(&movable_config(rig, motion)?)?),
         #[cfg(target_os = "linux")]
         ArmDriver::Franka => Ok(MovableFrankaArm::check(&motion_config(rig, motion)?).map_err(crate::Error::Failed)?),
-        _ => bail!("arms with this driver can only be read"),
+        _ => bail!("{READ_ONLY}"),
     }
 }
 
@@ -225,10 +236,10 @@ fn franka_arm(_rig: &Rig) -> crate::Result<Box<dyn Arm>> {
 }
 
 /// Opens an arm whose joint states are sent by another program.
-fn udp_arm(rig: &Rig) -> crate::Result<Box<dyn Arm>> {
-    let open = UdpArm::open(&rig.arm.joints, udp_arm_address(rig)?)?;
-    log::info!("arm: listening on {}", open.address());
-    Ok(Box::new(open))
+fn udp_arm(rig: &Rig) -> crate::Result<UdpArm> {
+    let arm = UdpArm::open(&rig.arm.joints, udp_arm_address(rig)?)?;
+    log::info!("arm: listening on {}", arm.address());
+    Ok(arm)
 }
 
 /// The address on which [`ArmDriver::Udp`] receives joint states.

@@ -17,6 +17,9 @@ pub struct Dataset {
     pub path: PathBuf,
     /// Images, sorted by file name (nerfstudio) or time (TUM); never empty.
     pub images: Vec<DatasetImage>,
+    /// PLY file of points on the surfaces of the scene, in the world frame of the images; it may not exist. `None` if the
+    /// dataset names none.
+    pub points_path: Option<PathBuf>,
     /// Number of images skipped because their file does not exist.
     pub n_missing: usize,
     /// Number of images skipped because their file is corrupt, or no pose or depth is close enough in time.
@@ -115,7 +118,7 @@ impl SkippedImages {
         }
         notes.extend(unusable_note(&self.unusable));
         let data_losses = self.lost.into_iter().chain(unusable_note(&self.broken)).collect();
-        Ok(Dataset { path: path.to_owned(), images, n_missing, n_unusable, notes, data_losses })
+        Ok(Dataset { path: path.to_owned(), images, points_path: None, n_missing, n_unusable, notes, data_losses })
     }
 }
 
@@ -130,10 +133,9 @@ fn plural(n: usize, noun: &str) -> (String, &'static str) {
     if n == 1 { (format!("1 {noun}"), "is") } else { (format!("{n} {noun}s"), "are") }
 }
 
-/// Joins the first names, with an ellipsis if there are more.
+/// The first names, and how many more there are.
 fn first_names(names: &[String]) -> String {
-    let more = if names.len() > SkippedImages::MAX_NAMED { ", ..." } else { "" };
-    format!("{}{more}", names[..names.len().min(SkippedImages::MAX_NAMED)].join(", "))
+    kinematics::shortened(names, SkippedImages::MAX_NAMED, ", ")
 }
 
 #[cfg(test)]

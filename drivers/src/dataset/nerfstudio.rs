@@ -18,8 +18,6 @@ use std::path::{Path, PathBuf};
 
 /// File that identifies such a folder.
 pub const FILE_NAME: &str = "transforms.json";
-/// Matrices with one decimal deviate from a rotation by up to this.
-const MAX_ROUNDING: f64 = 0.2;
 /// Relative difference of two focal lengths that are meant to be equal.
 const MAX_FOCAL_DIFFERENCE: f64 = 0.01;
 /// Depth counts are millimeters unless the file specifies another unit.
@@ -185,7 +183,9 @@ pub fn read(path: &Path) -> Result<Dataset, Error> {
         let (images, verb) = plural(missing_depth.len(), "depth image");
         notes.push(format!("{images} {verb} missing: {}", first_names(&missing_depth)));
     }
-    skipped.dataset(&folder, images, notes)
+    // The points are in the frame of the poses: nerfstudio applies `applied_transform` to both when it writes them.
+    let points_path = document.ply_file_path.map(|name| find_file(&folder, &name).unwrap_or_else(|| folder.join(name)));
+    Ok(Dataset { points_path, ..skipped.dataset(&folder, images, notes)? })
 }
 
 /// The whole file.
@@ -236,9 +236,6 @@ impl Document {
     /// Notes about keys that are not used.
     fn notes(&self) -> Vec<String> {
         let mut notes = Vec::new();
-        if let Some(file) = &self.ply_file_path {
-            notes.push(format!("the points in ply_file_path ({file:?}) are not used; training starts without them"));
-        }
         let unknown = |keys: &BTreeMap<String, Value>| -> Vec<String> {
             keys.keys().filter(|key| !UNUSED.contains(&key.as_str())).map(|key| format!("{key:?}")).collect()
         };
@@ -340,18 +337,7 @@ fn rows_of(matrix: &Matrix) -> Result<[f64; 16], String> {
 
 /// Converts an OpenGL camera pose to our convention. Also returns whether its numbers are rounded.
 fn world_from_camera(rows: &[f64; 16]) -> Result<(Transform, bool), String> {
-    let (world_from_opengl, is_rounded) = transform::from_rounded_rows(rows).map_err(|error| match error {
-        kinematics::Error::NotRigid { determinant, .. } if determinant < 0.0 => {
-            format!("{error}; it is mirrored: check the sign of each axis")
-        }
-        kinematics::Error::NotRigid { off, .. } if off > MAX_ROUNDING => {
-            format!("{error}; expected a rotation without scale and shear")
-        }
-        kinematics::Error::NotRigid { .. } => {
-            format!("{error}; if the numbers were rounded, write at least four decimals")
-        }
-        error => error.to_string(),
-    })?;
+    let (world_from_opengl, is_rounded) = transform::from_rounded_rows(rows).map_err(|error| error.to_string())?;
     Ok((world_from_opengl * opengl_from_camera(), is_rounded))
 }
 
@@ -467,15 +453,17 @@ impl CameraEntry {
     }
 }
 
-/// Finds the file with this name, or with this name plus one of the known extensions. Windows programs write `\\` as
-/// separator.
+/// Finds the file with this name. Windows programs write `\\` as separator.
+fn find_file(folder: &Path, name: &str) -> Option<PathBuf> {
+    [name, &name.replace('\\', "/")].into_iter().map(|name| folder.join(name)).find(|path| path.is_file())
+}
+
+/// Finds the file with this name, or with this name plus one of the known extensions.
 fn find_image(folder: &Path, name: &str) -> Option<PathBuf> {
-    let with_slashes = name.replace('\\', "/");
-    for name in [name, &with_slashes] {
-        let as_named = folder.join(name);
-        if as_named.is_file() {
-            return Some(as_named);
-        }
+    if let Some(path) = find_file(folder, name) {
+        return Some(path);
+    }
+    for name in [name, &name.replace('\\', "/")] {
         for extension in EXTENSIONS {
             for extension in [extension.to_owned(), extension.to_uppercase()] {
                 let path = folder.join(format!("{name}.{extension}"));

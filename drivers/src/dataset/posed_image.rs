@@ -2,17 +2,11 @@
 
 use crate::Error;
 use crate::decode::decode_complete;
-use image::{DynamicImage, ImageReader};
+use files::Budget;
+use image::{DynamicImage, ImageReader, RgbaImage};
 use kinematics::{Intrinsics, Stamp, Transform};
 use std::io::{Cursor, Read};
 use std::path::{Path, PathBuf};
-
-/// Maximum size of an image file.
-const MAX_IMAGE_BYTES: u64 = 1 << 30;
-/// Maximum number of pixels of a photo: 134 million. A small file of a uniform image can contain many more.
-const MAX_COLOR_PX: u64 = 1 << 27;
-/// Maximum number of pixels of a depth image: 34 million.
-const MAX_DEPTH_PX: u64 = 1 << 25;
 
 /// One posed photo on disk.
 #[derive(Clone, Debug, PartialEq)]
@@ -84,14 +78,14 @@ pub struct DepthImage {
 impl DatasetImage {
     /// Decodes the files of this image. If only the depth image fails to decode, the photo is still returned.
     pub fn load(&self) -> Result<LoadedImage, Error> {
-        let mut rgba = decode_file(&self.image_path, MAX_COLOR_PX)?.into_rgba8();
+        let mut rgba = into_rgba(decode_file(&self.image_path, Budget::COLOR_IMAGE)?);
         self.require_size(&self.image_path, [rgba.width(), rgba.height()])?;
         for pixel in rgba.pixels_mut() {
             pixel.0[3] = if pixel.0[3] == 0 { 0 } else { 255 };
         }
         let mut mask_warning = None;
         if let Some(mask_path) = &self.mask_path {
-            let mask = decode_file(mask_path, MAX_COLOR_PX)?;
+            let mask = decode_file(mask_path, Budget::COLOR_IMAGE)?;
             if is_in_alpha(&mask) {
                 mask_warning = Some(format!(
                     "{mask_path:?} is all black and stores its content in the alpha channel; save it as a gray image"
@@ -112,7 +106,7 @@ impl DatasetImage {
     }
 
     fn load_depth(&self, file: &DepthFile) -> Result<DepthImage, Error> {
-        let DynamicImage::ImageLuma16(counts) = decode_file(&file.path, MAX_DEPTH_PX)? else {
+        let DynamicImage::ImageLuma16(counts) = decode_file(&file.path, Budget::DEPTH_IMAGE)? else {
             return Err(Error::NotDepth { path: file.path.clone() });
         };
         #[expect(clippy::cast_possible_truncation, reason = "f32 is more precise than sensors")]
@@ -132,6 +126,26 @@ impl DatasetImage {
     }
 }
 
+/// Converts an image to RGBA. An RGB image is converted in place: with 134 million pixels, a copy takes half a gigabyte.
+fn into_rgba(image: DynamicImage) -> RgbaImage {
+    match image {
+        DynamicImage::ImageRgb8(rgb) => {
+            let (width, height) = rgb.dimensions();
+            let mut pixels = rgb.into_raw();
+            let n_px = pixels.len() / 3;
+            pixels.reserve_exact(n_px);
+            pixels.resize(4 * n_px, 255);
+            // From the last pixel to the first, so that no pixel is overwritten before it is moved.
+            for ix in (0..n_px).rev() {
+                let [red, green, blue] = [0, 1, 2].map(|channel| pixels[3 * ix + channel]);
+                pixels[4 * ix..4 * ix + 4].copy_from_slice(&[red, green, blue, 255]);
+            }
+            RgbaImage::from_raw(width, height, pixels).expect("it has four bytes per pixel")
+        }
+        other => other.into_rgba8(),
+    }
+}
+
 /// Whether a mask is black, but not equally transparent: it was made as transparency.
 fn is_in_alpha(mask: &DynamicImage) -> bool {
     if !mask.color().has_alpha() {
@@ -148,13 +162,13 @@ pub(super) fn image_size_px(path: &Path) -> Result<[u32; 2], Error> {
     Ok(size.into())
 }
 
-fn decode_file(path: &Path, max_px: u64) -> Result<DynamicImage, Error> {
-    let bytes = files::read(path, MAX_IMAGE_BYTES).map_err(|source| Error::Open { path: path.to_owned(), source })?;
+fn decode_file(path: &Path, budget: Budget) -> Result<DynamicImage, Error> {
+    let bytes = files::read(path, budget).map_err(|source| Error::Open { path: path.to_owned(), source })?;
     let reader = ImageReader::new(Cursor::new(&bytes)).with_guessed_format();
     let size = reader.map_err(image::ImageError::from).and_then(ImageReader::into_dimensions);
     let got_px: [u32; 2] = size.map_err(|source| decode_error(path, source))?.into();
-    if u64::from(got_px[0]) * u64::from(got_px[1]) > max_px {
-        return Err(Error::TooManyPixels { path: path.to_owned(), got_px, max_px });
+    if budget.check_elements(u64::from(got_px[0]) * u64::from(got_px[1])).is_err() {
+        return Err(Error::TooManyPixels { path: path.to_owned(), got_px, max_px: budget.max_elements });
     }
     decode_complete(&bytes, None).map_err(|source| decode_error(path, source))
 }
@@ -182,5 +196,24 @@ fn unsupported_format(path: &Path) -> Option<&'static str> {
         (b"ftyp", b"avif" | b"avis") => Some("AVIF"),
         (b"ftyp", b"heic" | b"heix" | b"hevc" | b"heim" | b"heis" | b"mif1" | b"msf1") => Some("HEIC"),
         _ => None,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use image::RgbImage;
+
+    #[test]
+    fn conversion_in_place_gives_the_same_pixels() {
+        for (width, height) in [(1, 1), (3, 2), (17, 5)] {
+            let bytes = (0..3 * width * height).map(|ix: u32| (ix * ix % 251) as u8).collect();
+            let rgb = DynamicImage::from(RgbImage::from_raw(width, height, bytes).unwrap());
+            let gray = DynamicImage::from(rgb.to_luma8());
+            for image in [rgb, gray] {
+                let (converted, expected) = (into_rgba(image.clone()), image.to_rgba8());
+                assert_eq!((converted.dimensions(), converted.as_raw()), (expected.dimensions(), expected.as_raw()));
+            }
+        }
     }
 }

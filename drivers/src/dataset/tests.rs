@@ -1,5 +1,7 @@
 //! Tests with real dataset folders and with small folders that the tests create.
 
+mod tum_tests;
+
 use super::*;
 use image::{ExtendedColorType, GrayImage, Luma, RgbImage};
 use kinematics::{Lens, Stamp};
@@ -47,7 +49,8 @@ fn fox_is_read_without_missing_photos() {
     let Some(folder) = test_support::data_folder("fox") else { return };
     let dataset = read(&folder).unwrap();
     assert_eq!((dataset.images.len(), dataset.n_missing, dataset.n_unusable), (50, 17, 0));
-    assert!(dataset.notes[0].starts_with("17 images are missing: "), "{:?}", dataset.notes);
+    let missing = &dataset.notes[0];
+    assert!(missing.starts_with("17 images are missing: ") && missing.ends_with(" and 12 more"), "{missing}");
     let first = &dataset.images[0];
     assert_eq!(first.name, "images/0001.jpg");
     assert_eq!(
@@ -561,7 +564,8 @@ fn keys_of_transforms_json_are_used_refused_or_named_as_documented() {
             let context = format!("{key} of a {place_of_key}: {use_of_key}: {after:?}");
             let loaded = |dataset: &Dataset| {
                 let load = |image: &DatasetImage| image.load().map(|loaded| (loaded.rgba_srgb, loaded.depth)).ok();
-                (dataset.images.clone(), dataset.images.iter().map(load).collect::<Vec<_>>())
+                let files = dataset.images.iter().map(load).collect::<Vec<_>>();
+                (dataset.images.clone(), files, dataset.points_path.clone())
             };
             match use_of_key {
                 "yes" => assert!(after.is_ok_and(|after| loaded(&after) != loaded(&before)), "{context}"),
@@ -579,6 +583,31 @@ fn keys_of_transforms_json_are_used_refused_or_named_as_documented() {
             }
         }
     }
+}
+
+/// The points are in the frame of the poses, and their path follows the same rules as those of images.
+#[test]
+fn path_of_points_is_returned() {
+    let (folder, mut document) = small_folder();
+    let read_path = |document: &Value| {
+        write_transforms(&folder, document);
+        let dataset = read(folder.path()).unwrap();
+        assert!(dataset.notes.is_empty(), "{:?}", dataset.notes);
+        dataset.points_path
+    };
+    assert_eq!(read_path(&document), None);
+    std::fs::create_dir(folder.path().join("sparse")).unwrap();
+    let points = folder.path().join("sparse/points.ply");
+    std::fs::write(&points, "ply").unwrap();
+    document["applied_transform"] = json!([[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]);
+    for name in ["sparse/points.ply", "sparse\\points.ply", points.to_str().unwrap()] {
+        document["ply_file_path"] = json!(name);
+        assert_eq!(read_path(&document).as_deref(), Some(&*points), "{name}");
+    }
+    document["ply_file_path"] = json!("../gone.ply");
+    assert_eq!(read_path(&document), Some(folder.path().join("../gone.ply")), "reading it names the path");
+    document["ply_file_path"] = Value::Null;
+    assert_eq!(read_path(&document), None);
 }
 
 #[test]

@@ -8,7 +8,8 @@ use super::{Dataset, DatasetImage, DepthFile, MAX_POSITION_M, SkippedImages, fir
 use crate::Error;
 use kinematics::{Intrinsics, Lens, Stamp, Transform, transform};
 use nalgebra::{Quaternion, UnitQuaternion, Vector3};
-use std::path::Path;
+use std::io::ErrorKind;
+use std::path::{Path, PathBuf};
 
 /// File that identifies such a folder.
 pub const COLOR_LIST: &str = "rgb.txt";
@@ -24,6 +25,8 @@ const MAX_POSE_INTERVAL_NANOS: i64 = 110_000_000;
 /// Poses are not interpolated over a gap of more than this number of usual intervals.
 const MAX_USUAL_INTERVALS: f64 = 1.5;
 const METERS_PER_COUNT: f64 = 1.0 / 5000.0;
+/// Size of the images of the cameras of the benchmark.
+const BENCHMARK_PX: [u32; 2] = [640, 480];
 
 /// Lens parameters of the cameras of the benchmark, by a part of the folder name: `fx fy cx cy`, then `k1 k2 p1 p2 k3`.
 const CAMERAS: [(&str, [f64; 9]); 3] = [
@@ -38,29 +41,30 @@ const CAMERAS: [(&str, [f64; 9]); 3] = [
 /// Reads a folder.
 ///
 /// Each photo gets the depth image closest in time, within 20 ms, and the pose interpolated at its stamp between two poses
-/// that are at most 40 ms apart, or 1.5 times the usual interval of the poses, up to 110 ms. Photos without a pose and
-/// invalid lines are skipped and counted. Lens parameters come from `calibration.txt`, else from the folder name.
+/// that are at most 40 ms apart, or 1.5 times the usual interval of the poses, up to 110 ms. Photos without a pose, photos
+/// of another size and invalid lines are skipped and counted. Lens parameters come from `calibration.txt`, else from the
+/// folder name. The details are in docs/reference/datasets.md.
 pub fn read(folder: &Path) -> Result<Dataset, Error> {
-    let camera = camera_of(folder)?;
+    let (camera, mut lens_px) = camera_of(folder)?;
     let mut skipped = SkippedImages::default();
     let colors = stamped_names(folder, COLOR_LIST, &mut skipped)?;
-    let depths = match folder.join(DEPTH_LIST).is_file() {
-        true => stamped_names(folder, DEPTH_LIST, &mut skipped)?,
-        false => Vec::new(),
+    let mut depths = match exists(&folder.join(DEPTH_LIST)) {
+        true => Some(stamped_names(folder, DEPTH_LIST, &mut skipped)?),
+        false => None,
     };
+    let repeated_depth = depths.as_mut().map(remove_repeated).unwrap_or_default();
     let poses = Poses::read(folder, &mut skipped)?;
     let (mut images, mut missing_depth): (Vec<DatasetImage>, Vec<String>) = (Vec::new(), Vec::new());
-    let mut n_without_depth = 0;
+    let (mut n_without_depth, mut depth_without_pose) = (0, Vec::new());
     for (stamp, name) in colors {
         if images.last().is_some_and(|last| last.stamp == stamp) {
             skipped.unusable.push((name, "another photo has the same time".to_owned()));
             continue;
         }
-        let image_path = folder.join(&name);
-        if !image_path.is_file() {
+        let Some(image_path) = find_file(folder, &name) else {
             skipped.missing.push(name);
             continue;
-        }
+        };
         let world_from_camera = match poses.at(stamp) {
             Ok(pose) => pose,
             Err(reason) => {
@@ -72,21 +76,32 @@ pub fn read(folder: &Path) -> Result<Dataset, Error> {
             skipped.broken.push((name, "not an image".to_owned()));
             continue;
         };
-        let depth = nearest(&depths, stamp).and_then(|(depth_stamp, depth_name)| {
-            let (path, pose) = (folder.join(depth_name), poses.at(*depth_stamp).ok()?);
-            Some(DepthFile { path, meters_per_count: METERS_PER_COUNT, world_from_camera: pose })
-        });
-        n_without_depth += usize::from(depth.is_none());
-        let depth = depth.filter(|depth| {
-            let exists = depth.path.is_file();
-            if !exists {
-                missing_depth.push(depth.path.strip_prefix(folder).unwrap_or(&depth.path).display().to_string());
-            }
-            exists
-        });
         let intrinsics = Intrinsics { size_px, ..camera.clone() };
-        if let Some(reason) = implausible(&intrinsics) {
+        if images.is_empty()
+            && let Some(reason) = implausible(&intrinsics)
+        {
             return Err(Error::DatasetFile { path: folder.to_owned(), reason });
+        }
+        // Without another statement, the lens parameters are those of the first photo.
+        let expected_px = *lens_px.get_or_insert(size_px);
+        if size_px != expected_px {
+            let [[width, height], [lens_width, lens_height]] = [size_px, expected_px];
+            let reason =
+                format!("it has {width}x{height} pixels, but the lens parameters are for {lens_width}x{lens_height}");
+            skipped.broken.push((name, reason));
+            continue;
+        }
+        let mut depth = None;
+        match depths.as_ref().map(|depths| nearest(depths, stamp)) {
+            None => {}
+            Some(None) => n_without_depth += 1,
+            Some(Some((depth_stamp, depth_name))) => match (poses.at(*depth_stamp), find_file(folder, depth_name)) {
+                (Err(reason), _) => depth_without_pose.push(format!("{depth_name} ({reason})")),
+                (Ok(_), None) => missing_depth.push(depth_name.clone()),
+                (Ok(world_from_camera), Some(path)) => {
+                    depth = Some(DepthFile { path, meters_per_count: METERS_PER_COUNT, world_from_camera });
+                }
+            },
         }
         images.push(DatasetImage {
             name,
@@ -100,39 +115,75 @@ pub fn read(folder: &Path) -> Result<Dataset, Error> {
         });
     }
     let mut notes = match n_without_depth {
-        _ if depths.is_empty() => Vec::new(),
         0 => Vec::new(),
         1 => vec!["1 photo has no depth image within 20 ms".to_owned()],
         n => vec![format!("{n} photos have no depth image within 20 ms")],
     };
-    if !missing_depth.is_empty() {
-        let (what, verb) = plural(missing_depth.len(), "depth image");
-        notes.push(format!("{what} {verb} missing: {}", first_names(&missing_depth)));
+    for (names, what) in [
+        (&missing_depth, "missing"),
+        (&depth_without_pose, "not used, because no pose belongs to the time"),
+        (&repeated_depth, "not used, because an earlier line has the same time; write times with more decimals"),
+    ] {
+        if !names.is_empty() {
+            let (images, verb) = plural(names.len(), "depth image");
+            notes.push(format!("{images} {verb} {what}: {}", first_names(names)));
+        }
     }
     skipped.dataset(folder, images, notes)
 }
 
-/// Lens parameters of a folder. The caller sets the size to that of each photo.
-fn camera_of(folder: &Path) -> Result<Intrinsics, Error> {
+/// Whether there is something with this name, also a broken link. Only then may errors be ignored.
+fn exists(path: &Path) -> bool {
+    !matches!(path.symlink_metadata(), Err(error) if error.kind() == ErrorKind::NotFound)
+}
+
+/// Finds a file of a list. Windows programs write `\\` as separator.
+fn find_file(folder: &Path, name: &str) -> Option<PathBuf> {
+    [name, &name.replace('\\', "/")].into_iter().map(|name| folder.join(name)).find(|path| path.is_file())
+}
+
+/// Removes entries with the time of an earlier one. Returns their names, except where they are equal.
+fn remove_repeated(entries: &mut Vec<(Stamp, String)>) -> Vec<String> {
+    let mut repeated = Vec::new();
+    entries.dedup_by(|later, first| {
+        if later.0 == first.0 && later.1 != first.1 {
+            repeated.push(later.1.clone());
+        }
+        later.0 == first.0
+    });
+    repeated
+}
+
+/// Lens parameters of a folder, and the size of the images to which they refer if it is known. The caller sets the size
+/// to that of each photo.
+fn camera_of(folder: &Path) -> Result<(Intrinsics, Option<[u32; 2]>), Error> {
     let path = folder.join(CAMERA_FILE);
-    let numbers = match files::read_text(&path) {
-        Ok(text) => camera_numbers(&text).map_err(|reason| Error::DatasetFile { path, reason })?,
-        Err(_) => camera_by_name(folder).ok_or_else(|| Error::NoIntrinsics { path: folder.to_owned() })?,
+    let (numbers, lens_px) = if exists(&path) {
+        let text = files::read_text(&path).map_err(|source| Error::Open { path: path.clone(), source })?;
+        (camera_numbers(&text).map_err(|reason| Error::DatasetFile { path, reason })?, None)
+    } else {
+        let numbers = camera_by_name(folder).ok_or_else(|| Error::NoIntrinsics { path: folder.to_owned() })?;
+        (numbers, Some(BENCHMARK_PX))
     };
     let [fx, fy, cx, cy, k1, k2, p1, p2, k3] = numbers;
     let lens = if numbers[4..] == [0.0; 5] { Lens::Pinhole } else { Lens::BrownConrady([k1, k2, p1, p2, k3]) };
     // Pixel centers are at integers in these files and at half-integers in ours.
     let (focal_px, principal_px) = ([fx, fy], [cx + 0.5, cy + 0.5]);
-    let intrinsics = Intrinsics { size_px: [640, 480], focal_px, principal_px, lens, rectified: false };
+    let intrinsics = Intrinsics { size_px: BENCHMARK_PX, focal_px, principal_px, lens, rectified: false };
     intrinsics
         .validate()
         .map_err(|error| Error::DatasetFile { path: folder.join(CAMERA_FILE), reason: error.to_string() })?;
-    Ok(intrinsics)
+    Ok((intrinsics, lens_px))
 }
 
 fn camera_numbers(text: &str) -> Result<[f64; 9], String> {
-    let words = text.lines().filter(|line| !line.starts_with('#')).flat_map(str::split_whitespace);
-    let mut numbers = words.map(str::parse).collect::<Result<Vec<f64>, _>>().map_err(|error| error.to_string())?;
+    let mut numbers = Vec::new();
+    for (line_ix, line) in text.lines().enumerate().filter(|(_, line)| !line.trim_start().starts_with('#')) {
+        for word in words(line) {
+            let number: f64 = word.parse().map_err(|_| format!("line {}: {word:?} is not a number", line_ix + 1))?;
+            numbers.push(number);
+        }
+    }
     if !matches!(numbers.len(), 4 | 8 | 9) {
         return Err(format!("{} numbers, expected fx fy cx cy and optionally k1 k2 p1 p2 k3", numbers.len()));
     }
@@ -151,7 +202,18 @@ struct Line {
     /// Number in the file, from 1.
     number: usize,
     stamp: Stamp,
-    words: Vec<String>,
+    /// What follows the time.
+    rest: String,
+}
+
+/// Whether columns are separated by this character; the programs of the benchmark accept commas, too.
+fn is_separator(c: char) -> bool {
+    c.is_whitespace() || c == ','
+}
+
+/// The columns of a line.
+fn words(line: &str) -> impl Iterator<Item = &str> {
+    line.split(is_separator).filter(|word| !word.is_empty())
 }
 
 /// Lines of a list, sorted by time. Invalid lines are skipped.
@@ -165,13 +227,16 @@ fn stamped_lines(folder: &Path, list: &str, skipped: &mut SkippedImages) -> Resu
     let mut invalid = Vec::new();
     for (line_ix, line) in text.lines().enumerate() {
         let number = line_ix + 1;
-        let mut words = line.split_whitespace().map(str::to_owned);
-        let Some(first) = words.next().filter(|word| !word.starts_with('#')) else { continue };
-        let words: Vec<String> = words.collect();
-        match stamp_of(&first) {
+        let line = line.trim();
+        if line.is_empty() || line.starts_with('#') {
+            continue;
+        }
+        let (first, rest) = line.split_once(is_separator).unwrap_or((line, ""));
+        let rest = rest.trim_start_matches(is_separator).to_owned();
+        match stamp_of(first) {
             None => invalid.push(format!("line {number}: {first:?} is not a time in seconds")),
-            Some(_) if words.is_empty() => invalid.push(format!("line {number}: nothing follows the time")),
-            Some(stamp) => lines.push(Line { number, stamp, words }),
+            Some(_) if rest.is_empty() => invalid.push(format!("line {number}: nothing follows the time")),
+            Some(stamp) => lines.push(Line { number, stamp, rest }),
         }
     }
     if let (true, Some(first)) = (lines.is_empty(), invalid.first()) {
@@ -184,7 +249,7 @@ fn stamped_lines(folder: &Path, list: &str, skipped: &mut SkippedImages) -> Resu
 
 fn stamped_names(folder: &Path, list: &str, skipped: &mut SkippedImages) -> Result<Vec<(Stamp, String)>, Error> {
     let lines = stamped_lines(folder, list, skipped)?;
-    Ok(lines.into_iter().map(|line| (line.stamp, line.words.join(" "))).collect())
+    Ok(lines.into_iter().map(|line| (line.stamp, line.rest)).collect())
 }
 
 /// Parses a decimal number of seconds, such as `1305031102.175304` or `1.305031102175304e+09`, and rounds it down to a
@@ -233,8 +298,8 @@ impl Poses {
     fn read(folder: &Path, skipped: &mut SkippedImages) -> Result<Self, Error> {
         let mut poses: Vec<(Stamp, Transform)> = Vec::new();
         let (mut invalid, mut repeated) = (Vec::new(), Vec::new());
-        for Line { number, stamp, words } in stamped_lines(folder, POSE_LIST, skipped)? {
-            match pose_of(&words) {
+        for Line { number, stamp, rest } in stamped_lines(folder, POSE_LIST, skipped)? {
+            match pose_of(&rest) {
                 Err(reason) => invalid.push(format!("line {number}: {reason}")),
                 Ok(pose) if poses.last().is_some_and(|(last, other)| *last == stamp && *other != pose) => {
                     repeated.push(format!("line {number}"));
@@ -291,8 +356,8 @@ fn max_interval_nanos(poses: &[(Stamp, Transform)]) -> i64 {
     max.clamp(2 * MAX_GAP_NANOS, MAX_POSE_INTERVAL_NANOS)
 }
 
-fn pose_of(words: &[String]) -> Result<Transform, &'static str> {
-    let numbers: Option<Vec<f64>> = words.iter().map(|word| word.parse().ok()).collect();
+fn pose_of(columns: &str) -> Result<Transform, &'static str> {
+    let numbers: Option<Vec<f64>> = words(columns).map(|word| word.parse().ok()).collect();
     let Some([x, y, z, qx, qy, qz, qw]) = numbers.as_deref() else {
         return Err("expected seven numbers tx ty tz qx qy qz qw after the time");
     };

@@ -340,7 +340,8 @@ impl StateReader {
         Some(stamp)
     }
 
-    /// Logs the robot's mode whenever it changes.
+    /// Logs the robot's mode whenever it changes. If the arm can be moved, its motion loop reports reflexes, with the
+    /// robot's reply about the motion.
     fn log_mode(&mut self, state: &RobotState) {
         if state.robot_mode == self.mode {
             return;
@@ -348,7 +349,7 @@ impl StateReader {
         self.mode = state.robot_mode;
         let (address, mode) = (&self.address, self.mode);
         match mode {
-            RobotMode::Reflex => {
+            RobotMode::Reflex if self.motion_loop.is_none() => {
                 let reasons = state.last_motion_errors.names().join(", ");
                 log::warn!("arm at {address}: stopped by a reflex: {reasons}");
             }

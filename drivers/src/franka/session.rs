@@ -13,8 +13,8 @@ const MAX_ANSWER: Duration = Duration::from_secs(2);
 /// Interval of checks for an answer.
 const POLL_INTERVAL: Duration = Duration::from_millis(1);
 /// Hint in the error if a controller rejects the connection.
-const ONE_CLIENT_HINT: &str = "FCI accepts one client at a time: stop the other one, or let it send the joint states and set \
-                          arm.driver = \"udp\" (docs/reference/udp.md)";
+const ONE_CLIENT_HINT: &str = "FCI accepts one client at a time: stop the other one; if the arm is only read, that one may \
+                          send the joint states instead (arm.driver = \"udp\", docs/reference/udp.md)";
 
 /// An open connection. Dropping it closes the connection.
 #[derive(Debug)]

@@ -8,6 +8,7 @@ use std::collections::BTreeMap;
 const SCHEMA: u8 = 0x03;
 const CHANNEL: u8 = 0x04;
 const MESSAGE: u8 = 0x05;
+const METADATA: u8 = 0x0C;
 
 /// A decoded record.
 #[derive(Debug, PartialEq, Eq)]
@@ -20,6 +21,7 @@ pub(super) enum Record<'a> {
         id: u16,
         schema_id: u16,
         topic: &'a str,
+        encoding: &'a str,
         metadata: BTreeMap<&'a str, &'a str>,
     },
     Message {
@@ -29,6 +31,10 @@ pub(super) enum Record<'a> {
     Attachment {
         name: &'a str,
         data: &'a [u8],
+    },
+    /// Entries of another program under a common name.
+    Metadata {
+        name: &'a str,
     },
     /// Other records: indices, statistics and records of newer writers.
     Other,
@@ -52,14 +58,14 @@ impl<'a> Record<'a> {
             SCHEMA => Self::Schema { id: fields.two()?, name: fields.text()? },
             CHANNEL => {
                 let (id, schema_id, topic) = (fields.two()?, fields.two()?, fields.text()?);
-                let _encoding = fields.text()?;
+                let encoding = fields.text()?;
                 let n_bytes = fields.four()?.into();
                 let mut entries = Fields(fields.bytes(n_bytes)?);
                 let mut metadata = BTreeMap::new();
                 while !entries.0.is_empty() {
                     metadata.insert(entries.text()?, entries.text()?);
                 }
-                Self::Channel { id, schema_id, topic, metadata }
+                Self::Channel { id, schema_id, topic, encoding, metadata }
             }
             MESSAGE => {
                 let channel_id = fields.two()?;
@@ -79,6 +85,7 @@ impl<'a> Record<'a> {
                 }
                 Self::Attachment { name, data }
             }
+            METADATA => Self::Metadata { name: fields.text()? },
             _ => Self::Other,
         })
     }
@@ -141,9 +148,10 @@ mod tests {
         let complete = attachment(crc32fast::hash);
         let metadata = BTreeMap::from([("joint_names", "a,b")]);
         for (opcode, bytes, expected) in [
-            (CHANNEL, &channel, Record::Channel { id: 7, schema_id: 3, topic: "/joints", metadata }),
+            (CHANNEL, &channel, Record::Channel { id: 7, schema_id: 3, topic: "/joints", encoding: "json", metadata }),
             (SCHEMA, &schema, Record::Schema { id: 3, name: "s" }),
             (ATTACHMENT, &complete, Record::Attachment { name: "rig.toml", data: b"abc" }),
+            (METADATA, &text("calibration"), Record::Metadata { name: "calibration" }),
         ] {
             assert_eq!(Record::decode(opcode, bytes), Ok(expected));
             for n_bytes in 0..7 {

@@ -5,12 +5,11 @@
 //! a compressed chunk is decompressed as a whole.
 
 use crc32fast::Hasher;
+use files::Budget;
 use lz4_flex::frame::FrameDecoder;
 use ruzstd::decoding::StreamingDecoder;
 use std::io::{Cursor, Read, Seek, SeekFrom};
 
-/// Maximum length of a record. Longer records are treated as damage; the largest valid record contains one image.
-const MAX_RECORD_BYTES: u64 = 512 << 20;
 /// Maximum allocation before any byte of a record was read.
 const MAX_PREALLOCATED_BYTES: u64 = 1 << 20;
 /// Length of a record's header: opcode and length.
@@ -179,9 +178,9 @@ fn array<const N: usize>(mut input: impl Read) -> Result<[u8; N], ReadError> {
     Ok(bytes)
 }
 
-/// Reads the given number of bytes. Memory grows with the bytes received.
+/// Reads the given number of bytes; more than [`Budget::RECORD`] are damage. Memory grows with the bytes received.
 fn bytes_of(input: &mut (impl Read + ?Sized), n_bytes: u64) -> Result<Vec<u8>, ReadError> {
-    if n_bytes > MAX_RECORD_BYTES {
+    if Budget::RECORD.check_bytes(n_bytes).is_err() {
         return Err(ReadError::TooLong { n_bytes });
     }
     let n_preallocated = usize::try_from(n_bytes.min(MAX_PREALLOCATED_BYTES)).expect("at most one megabyte");
@@ -214,7 +213,7 @@ fn decompress_lz4(frames: &mut &[u8], n_bytes: u64, records: &mut Vec<u8>) -> st
 
 /// Decompresses the frames of a chunk to the declared number of bytes.
 fn decompress_all(decompress: Decompress, mut frames: &[u8], declared_bytes: u64) -> Result<Vec<u8>, ReadError> {
-    if declared_bytes > MAX_RECORD_BYTES {
+    if Budget::RECORD.check_bytes(declared_bytes).is_err() {
         return Err(ReadError::TooLong { n_bytes: declared_bytes });
     }
     let mut records = Vec::new();

@@ -1,9 +1,16 @@
 //! Topics of a recording and their contents.
 
-use crate::wire::{descriptor, joint_state};
+use crate::wire::descriptor::{CAMERA_CALIBRATION, COMPRESSED_IMAGE, FRAME_TRANSFORM, POINT_CLOUD, RAW_IMAGE, Schema};
+use crate::wire::joint_state;
 
 /// Metadata key of the joint names, separated by commas, in the channel of the joints.
 pub(super) const JOINT_NAMES: &str = "joint_names";
+/// Metadata key of the scale of depth counts, in the channel of the depth images.
+pub(super) const METERS_PER_COUNT: &str = "meters_per_count";
+
+/// MCAP's names of the encodings of messages.
+const PROTOBUF: &str = "protobuf";
+const JSON: &str = "json";
 
 /// Contents of a topic.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -47,6 +54,35 @@ impl Topic {
         }
     }
 
+    /// Message types of the topic in protobuf; none for joint states, which are JSON.
+    pub(super) fn schemas(&self) -> &'static [Schema] {
+        match self {
+            Self::Color(_) | Self::TrueColor(_) => &[COMPRESSED_IMAGE, RAW_IMAGE],
+            Self::Depth(_) | Self::TrueDepth(_) => &[RAW_IMAGE],
+            Self::Calibration(_) => &[CAMERA_CALIBRATION],
+            Self::TruePose(_) | Self::Base | Self::TrueBase => &[FRAME_TRANSFORM],
+            Self::Range(_) => &[POINT_CLOUD],
+            Self::Joints => &[],
+        }
+    }
+
+    /// Names of the message types that can be read, and their encoding.
+    pub(super) fn readable(&self) -> (Vec<&'static str>, &'static str) {
+        match self {
+            Self::Joints => (vec![joint_state::SCHEMA_NAME], JSON),
+            _ => (self.schemas().iter().map(|schema| schema.name).collect(), PROTOBUF),
+        }
+    }
+
+    /// The key that is used of the metadata of a channel.
+    pub(super) fn metadata_key(&self) -> Option<&'static str> {
+        match self {
+            Self::Joints => Some(JOINT_NAMES),
+            Self::Depth(_) => Some(METERS_PER_COUNT),
+            _ => None,
+        }
+    }
+
     /// Parses a topic name. Returns `None` for topics of other programs.
     pub(super) fn from_name(name: &str) -> Option<Self> {
         match name {
@@ -83,12 +119,12 @@ pub(super) struct Encoding {
 
 impl Encoding {
     /// A Foxglove message in protobuf.
-    pub(super) fn protobuf(schema: descriptor::Schema) -> Self {
+    pub(super) fn protobuf(schema: Schema) -> Self {
         Self {
             schema_name: schema.name,
-            schema_encoding: "protobuf",
+            schema_encoding: PROTOBUF,
             schema: schema.file_descriptor_set(),
-            message_encoding: "protobuf",
+            message_encoding: PROTOBUF,
         }
     }
 
@@ -98,7 +134,7 @@ impl Encoding {
             schema_name: joint_state::SCHEMA_NAME,
             schema_encoding: "jsonschema",
             schema: joint_state::SCHEMA.into(),
-            message_encoding: "json",
+            message_encoding: JSON,
         }
     }
 }

@@ -3,7 +3,7 @@
 //! Chunks are closed at least once per second of sample time, so a crash loses at most one second.
 
 use super::reader::Recording;
-use super::topic::{Encoding, JOINT_NAMES, Topic};
+use super::topic::{Encoding, JOINT_NAMES, METERS_PER_COUNT, Topic};
 use crate::wire::{descriptor, foxglove, joint_state, point_cloud};
 use crate::{Error, Image, PixelFormat, RecordedSpan, Sample, Source, TruthImage};
 use files::{Kept, Place};
@@ -249,7 +249,7 @@ impl Recorder {
         let encoding = Encoding::protobuf(foxglove::schema_of(image.format));
         let channel = match image.format {
             PixelFormat::DepthU16 { meters_per_count } => {
-                self.channel(topic, encoding, "meters_per_count", &meters_per_count.to_string())?
+                self.channel(topic, encoding, METERS_PER_COUNT, &meters_per_count.to_string())?
             }
             _ => self.channel(topic, encoding, "", "")?,
         };

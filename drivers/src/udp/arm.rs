@@ -1,6 +1,6 @@
 //! An arm whose joint states are received over UDP, for example from the program that moves it.
 
-use super::counts::DatagramCounts;
+use super::counts::{DatagramCounts, DatagramMonitor};
 use super::reader::DatagramReader;
 use crate::wire::datagram::decode_joints;
 use crate::{Arm, Error};
@@ -29,6 +29,11 @@ impl UdpArm {
     /// Statistics of the datagrams so far.
     pub fn counts(&self) -> DatagramCounts {
         self.states.counts()
+    }
+
+    /// The same statistics for another thread.
+    pub fn monitor(&self) -> DatagramMonitor {
+        self.states.monitor()
     }
 }
 

@@ -1,6 +1,6 @@
 //! A base whose poses are received over UDP, for example from its own localization.
 
-use super::counts::{DatagramCounts, count_and_warn};
+use super::counts::{DatagramCounts, DatagramMonitor, count_and_warn};
 use super::reader::DatagramReader;
 use crate::wire::datagram::decode_pose;
 use crate::{Base, BasePose, Error};
@@ -32,6 +32,11 @@ impl UdpBase {
     pub fn counts(&self) -> DatagramCounts {
         self.poses.counts()
     }
+
+    /// The same statistics for another thread.
+    pub fn monitor(&self) -> DatagramMonitor {
+        self.poses.monitor()
+    }
 }
 
 impl Base for UdpBase {
@@ -45,6 +50,7 @@ impl Base for UdpBase {
                 Some([m, rad]) if m > self.max_sigma[0] || rad > self.max_sigma[1] => {
                     let what = format_args!("skipped a pose with a standard deviation of {m:.3} m and {rad:.4} rad");
                     count_and_warn("base", &mut self.poses.counts.n_uncertain, 1, what);
+                    self.poses.publish_counts();
                 }
                 _ => return Ok(BasePose { stamp, world_from_base: pose.world_from_base }),
             }

@@ -1,8 +1,11 @@
 //! Statistics of the datagrams of one device.
 
 use kinematics::Stamp;
+use parking_lot::Mutex;
+use std::collections::VecDeque;
 use std::fmt;
 use std::net::SocketAddr;
+use std::sync::Arc;
 use std::time::Duration;
 
 /// Statistics of the datagrams of one device since it was opened.
@@ -31,6 +34,54 @@ pub struct DatagramCounts {
     pub n_clock_restarts: u64,
 }
 
+/// Statistics of the datagrams of a device that is read by another thread. Clones share them.
+#[derive(Clone, Debug)]
+pub struct DatagramMonitor {
+    device: String,
+    address: SocketAddr,
+    state: Arc<Mutex<MonitorState>>,
+}
+
+#[derive(Debug, Default)]
+struct MonitorState {
+    counts: DatagramCounts,
+    last_rejection: Option<String>,
+}
+
+impl DatagramMonitor {
+    pub(super) fn new(device: &str, address: SocketAddr) -> Self {
+        Self { device: device.to_owned(), address, state: Arc::default() }
+    }
+
+    /// Name of the device in messages.
+    pub fn device(&self) -> &str {
+        &self.device
+    }
+
+    /// Address on which it listens.
+    pub fn address(&self) -> SocketAddr {
+        self.address
+    }
+
+    /// Statistics of the datagrams read so far.
+    pub fn counts(&self) -> DatagramCounts {
+        self.state.lock().counts
+    }
+
+    /// Why the last rejected datagram was rejected; `None` if none was.
+    pub fn last_rejection(&self) -> Option<String> {
+        self.state.lock().last_rejection.clone()
+    }
+
+    pub(super) fn set_counts(&self, counts: DatagramCounts) {
+        self.state.lock().counts = counts;
+    }
+
+    pub(super) fn set_last_rejection(&self, reason: String) {
+        self.state.lock().last_rejection = Some(reason);
+    }
+}
+
 /// Message for a restart of the sender's clock.
 pub(super) const CLOCK_RESTARTED: &str = "the sender's clock restarted or jumped, or it does not count nanoseconds";
 
@@ -38,10 +89,22 @@ pub(super) const CLOCK_RESTARTED: &str = "the sender's clock restarted or jumped
 /// new address.
 const MAX_SENDER_SILENCE: Duration = Duration::from_secs(2);
 
+/// This many datagrams from as many ports of one host, none of which is used twice, come from a single program that opens a
+/// socket for each datagram: up to four programs that keep their sockets would repeat a port.
+const MIN_NEW_PORTS: usize = 5;
+/// Number of recent ports of such a program that are remembered. Few, because systems choose ports at random.
+const MAX_RECENT_PORTS: usize = 8;
+
 /// The current sender: one at a time, so that the data of two programs cannot mix.
 #[derive(Debug, Default)]
 pub(super) struct Senders {
     current: Option<(SocketAddr, Stamp)>,
+    /// Whether the current sender has used its port more than once.
+    keeps_port: bool,
+    /// Whether the current sender uses a new port for each datagram, so that only the host identifies it.
+    has_new_ports: bool,
+    /// Recent ports of the current sender's host, the newest last; empty if the sender keeps its port.
+    recent_ports: VecDeque<u16>,
     n_changes: u64,
 }
 
@@ -49,22 +112,72 @@ impl Senders {
     /// Returns whether to use a datagram from this address. Counts and logs the others.
     pub(super) fn accepts(&mut self, device: &str, from: SocketAddr, at: Stamp, n_foreign: &mut u64) -> bool {
         match self.current {
-            Some((current, last)) if current != from && at.duration_since(last) < MAX_SENDER_SILENCE => {
-                let what =
-                    format_args!("ignored a datagram from {from}, because {current} is also sending; stop one of them");
-                count_and_warn(device, n_foreign, 1, what);
-                return false;
+            Some((current, last)) if !self.is_current(current, from) => {
+                let is_silent = at.duration_since(last) >= MAX_SENDER_SILENCE;
+                if self.finds_new_ports(current, from) {
+                    log::warn!(
+                        "{device}: every datagram comes from another port of {}, so its sender opens a socket for each of \
+                         them; datagrams from all ports of this host are used from now on. Let the sender keep one \
+                         socket, so that a second sender on this host can be ignored",
+                        from.ip()
+                    );
+                } else if is_silent {
+                    let what = format_args!(
+                        "now receiving from {from}; {current} was silent for more than {MAX_SENDER_SILENCE:?}"
+                    );
+                    count_and_warn(device, &mut self.n_changes, 1, what);
+                    if self.has_new_ports || current.ip() != from.ip() {
+                        (self.has_new_ports, self.recent_ports) = (false, VecDeque::new());
+                    }
+                } else {
+                    let ports = if self.has_new_ports { ", with a new port for each datagram," } else { "" };
+                    let what = format_args!(
+                        "ignored a datagram from {from}, because {current}{ports} is also sending; stop one of them"
+                    );
+                    count_and_warn(device, n_foreign, 1, what);
+                    return false;
+                }
+                self.keeps_port = false;
             }
-            Some((current, _)) if current != from => {
-                let what = format_args!(
-                    "now receiving from {from}; {current} was silent for more than {MAX_SENDER_SILENCE:?}"
-                );
-                count_and_warn(device, &mut self.n_changes, 1, what);
+            Some(_) if !self.has_new_ports => {
+                self.keeps_port = true;
+                self.recent_ports.clear();
             }
             _ => {}
         }
+        if self.has_new_ports && self.recent_ports.back() != Some(&from.port()) {
+            self.recent_ports.push_back(from.port());
+            if self.recent_ports.len() > MAX_RECENT_PORTS {
+                self.recent_ports.pop_front();
+            }
+        }
         self.current = Some((from, at));
         true
+    }
+
+    /// Whether a datagram comes from the current sender.
+    fn is_current(&self, current: SocketAddr, from: SocketAddr) -> bool {
+        match self.has_new_ports {
+            true => current.ip() == from.ip() && !self.recent_ports.contains(&from.port()),
+            false => current == from,
+        }
+    }
+
+    /// Notes a datagram from another address than the current one. Returns whether it shows that the sender uses a new port
+    /// for each datagram.
+    fn finds_new_ports(&mut self, current: SocketAddr, from: SocketAddr) -> bool {
+        if self.has_new_ports || self.keeps_port || current.ip() != from.ip() {
+            return false;
+        }
+        if self.recent_ports.contains(&from.port()) {
+            self.recent_ports.clear(); // A second program, which keeps its port.
+        }
+        if self.recent_ports.is_empty() {
+            self.recent_ports.push_back(current.port());
+        }
+        self.recent_ports.push_back(from.port());
+        self.has_new_ports = self.recent_ports.len() >= MIN_NEW_PORTS;
+        self.has_new_ports
     }
 }
 
@@ -119,6 +232,39 @@ mod tests {
         assert!(accepts(second, 3000), "the first has been silent for 2 s");
         assert!(!accepts(first, 3001) && accepts(second, 3002));
         assert_eq!(n_foreign, 3);
+    }
+
+    #[test]
+    fn sender_with_a_new_port_for_each_datagram_is_identified_by_its_host() {
+        let (mut senders, mut n_foreign) = (Senders::default(), 0);
+        let at_port = |port| SocketAddr::from(([127, 0, 0, 1], port));
+        let elsewhere = SocketAddr::from(([127, 0, 0, 2], 1000));
+        let mut accepts = |from, millis: i64| senders.accepts("arm", from, Stamp(millis * 1_000_000), &mut n_foreign);
+        assert!(accepts(at_port(1), 0));
+        let accepted: Vec<bool> = (2..100).map(|ix| accepts(at_port(ix), 10 * i64::from(ix))).collect();
+        assert!(!accepted[..3].contains(&true) && !accepted[3..].contains(&false), "{accepted:?}");
+        assert!(!accepts(elsewhere, 1000), "another host");
+        assert!(!accepts(at_port(98), 1001), "a second program on the host, which keeps its port");
+        assert!(accepts(at_port(100), 1002) && !accepts(at_port(98), 1003));
+        assert!(accepts(elsewhere, 3002) && !accepts(at_port(101), 3003), "a host that was silent is replaced");
+        assert!(accepts(elsewhere, 3004));
+        assert_eq!(n_foreign, 7);
+    }
+
+    #[test]
+    fn several_senders_that_keep_their_ports_do_not_mix() {
+        let (mut senders, mut n_foreign) = (Senders::default(), 0);
+        let at_port = |port| SocketAddr::from(([127, 0, 0, 1], port));
+        let mut accepts = |from, millis: i64| senders.accepts("arm", from, Stamp(millis * 1_000_000), &mut n_foreign);
+        for round in 0..50 {
+            let n_accepted = (1..=4).filter(|port| accepts(at_port(*port), 10 * round + i64::from(*port))).count();
+            assert_eq!(n_accepted, 1, "round {round}");
+        }
+        // The first one has stopped.
+        let until_silent = (50..240).flat_map(|round| [2, 3].map(|port| (port, 10 * round)));
+        let n_accepted = until_silent.filter(|(port, millis)| accepts(at_port(*port), *millis)).count();
+        assert_eq!(n_accepted, 0);
+        assert!(accepts(at_port(2), 2501) && !accepts(at_port(3), 2502) && accepts(at_port(2), 2503));
     }
 
     #[test]

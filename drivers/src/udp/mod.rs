@@ -15,5 +15,5 @@ mod tests;
 
 pub use arm::UdpArm;
 pub use base::UdpBase;
-pub use counts::DatagramCounts;
+pub use counts::{DatagramCounts, DatagramMonitor};
 pub use scanner::UdpScanner;

@@ -1,6 +1,6 @@
 //! Reads values that each fit in one datagram.
 
-use super::counts::{CLOCK_RESTARTED, DatagramCounts, Senders, count_and_warn};
+use super::counts::{CLOCK_RESTARTED, DatagramCounts, DatagramMonitor, Senders, count_and_warn};
 use super::receiver::{ReceivedDatagram, Receiver};
 use super::sequence::{self, SequencePosition, SequenceTracker};
 use crate::Error;
@@ -18,6 +18,7 @@ pub(super) struct DatagramReader {
     receiver: Receiver,
     pub(super) sequence: SequenceTracker,
     pub(super) counts: DatagramCounts,
+    monitor: DatagramMonitor,
     senders: Senders,
 }
 
@@ -25,8 +26,9 @@ impl DatagramReader {
     /// Listens. With port 0, a free port is used.
     pub(super) fn open(device: &str, plural: &'static str, address: SocketAddr) -> Result<Self, Error> {
         let receiver = Receiver::open(device.to_owned(), address)?;
+        let monitor = DatagramMonitor::new(device, receiver.address());
         let (sequence, counts, senders) = (SequenceTracker::default(), DatagramCounts::default(), Senders::default());
-        Ok(Self { plural, receiver, sequence, counts, senders })
+        Ok(Self { plural, receiver, sequence, counts, monitor, senders })
     }
 
     /// Address it listens on.
@@ -39,6 +41,16 @@ impl DatagramReader {
         self.counts
     }
 
+    /// The same statistics for another thread.
+    pub(super) fn monitor(&self) -> DatagramMonitor {
+        self.monitor.clone()
+    }
+
+    /// Updates the statistics that other threads see.
+    pub(super) fn publish_counts(&self) {
+        self.monitor.set_counts(self.counts);
+    }
+
     /// Returns the next value that `decode` accepts with its stamp on our clock, or `None` if none came in time. A datagram
     /// without a value, such as the state of a gripper, only counts in the sequence.
     pub(super) fn next<T>(
@@ -48,8 +60,10 @@ impl DatagramReader {
     ) -> Result<Option<(Stamp, T)>, Error> {
         let until = Instant::now() + timeout;
         while let Some(datagram) = self.receiver.next(until)? {
-            if let Some(reading) = self.take(&datagram, &decode) {
-                return Ok(Some(reading));
+            let reading = self.take(&datagram, &decode);
+            self.publish_counts();
+            if reading.is_some() {
+                return Ok(reading);
             }
             if Instant::now() >= until {
                 break; // Even if invalid datagrams keep arriving.
@@ -63,7 +77,7 @@ impl DatagramReader {
         datagram: &ReceivedDatagram,
         decode: impl Fn(&[u8]) -> Result<(DatagramHeader, Option<T>), Malformed>,
     ) -> Option<(Stamp, T)> {
-        let Self { plural, receiver, sequence, counts, senders } = self;
+        let Self { plural, receiver, sequence, counts, monitor, senders } = self;
         let device = receiver.device();
         counts.n_received += 1;
         count_and_warn(
@@ -76,6 +90,7 @@ impl DatagramReader {
             Ok(decoded) => decoded,
             Err(error) => {
                 count_and_warn(device, &mut counts.n_rejected, 1, format_args!("rejected a datagram: {error}"));
+                monitor.set_last_rejection(error.to_string());
                 return None;
             }
         };
@@ -107,12 +122,9 @@ impl DatagramReader {
         let stamp = sequence.stamp(&header, datagram.at);
         count_and_warn(device, &mut counts.n_clock_restarts, sequence.n_clock_restarts() - n_before, CLOCK_RESTARTED);
         if stamp.is_none() {
-            let stamp_nanos = header.stamp_nanos;
-            let hint = sequence::hint(&header, datagram.at);
-            let what = format_args!(
-                "rejected a datagram: the stamp {stamp_nanos} is not after the previous one, or not recent{hint}"
-            );
-            count_and_warn(device, &mut counts.n_rejected, 1, what);
+            let reason = sequence::rejection(&header, datagram.at);
+            count_and_warn(device, &mut counts.n_rejected, 1, format_args!("rejected a datagram: {reason}"));
+            monitor.set_last_rejection(reason);
         }
         Some((stamp?, reading))
     }

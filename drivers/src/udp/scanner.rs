@@ -1,6 +1,6 @@
 //! A range scanner whose scans are received over UDP, each in one or more datagrams.
 
-use super::counts::{CLOCK_RESTARTED, DatagramCounts, Senders, count_and_warn};
+use super::counts::{CLOCK_RESTARTED, DatagramCounts, DatagramMonitor, Senders, count_and_warn};
 use super::receiver::{ReceivedDatagram, Receiver};
 use super::sequence::{self, SequencePosition, SequenceTracker};
 use crate::wire::datagram::{DatagramHeader, ScanPart, decode_scan};
@@ -21,6 +21,7 @@ pub struct UdpScanner {
     receiver: Receiver,
     sequence: SequenceTracker,
     counts: DatagramCounts,
+    monitor: DatagramMonitor,
     senders: Senders,
     /// The scan whose parts are arriving.
     partial_scan: Option<PartialScan>,
@@ -38,11 +39,13 @@ impl UdpScanner {
     /// Listens for the scanner of this name. With port 0, a free port is used.
     pub fn open(name: &str, address: SocketAddr) -> Result<Self, Error> {
         let receiver = Receiver::open(format!("range scanner {name:?}"), address)?;
+        let monitor = DatagramMonitor::new(receiver.device(), receiver.address());
         Ok(Self {
             name: name.into(),
             receiver,
             sequence: SequenceTracker::default(),
             counts: DatagramCounts::default(),
+            monitor,
             senders: Senders::default(),
             partial_scan: None,
             completed: VecDeque::new(),
@@ -57,6 +60,11 @@ impl UdpScanner {
     /// Statistics of the datagrams so far.
     pub fn counts(&self) -> DatagramCounts {
         self.counts
+    }
+
+    /// The same statistics for another thread.
+    pub fn monitor(&self) -> DatagramMonitor {
+        self.monitor.clone()
     }
 
     /// Resets the state to before the first datagram.
@@ -114,9 +122,7 @@ impl UdpScanner {
         let n_new_restarts = self.sequence.n_clock_restarts() - n_before;
         count_and_warn(self.receiver.device(), &mut self.counts.n_clock_restarts, n_new_restarts, CLOCK_RESTARTED);
         let Some(stamp) = stamp else {
-            let (stamp_nanos, hint) = (part.header.stamp_nanos, sequence::hint(&part.header, arrival));
-            return self
-                .reject(format_args!("the stamp {stamp_nanos} is not after the previous one, or not recent{hint}"));
+            return self.reject(format_args!("{}", sequence::rejection(&part.header, arrival)));
         };
         let parts = vec![None; part.n_parts as usize];
         self.partial_scan = Some(PartialScan { header: part.header, stamp, parts });
@@ -166,6 +172,7 @@ impl UdpScanner {
             1,
             format_args!("rejected a datagram: {reason}"),
         );
+        self.monitor.set_last_rejection(reason.to_string());
     }
 }
 
@@ -182,6 +189,7 @@ impl RangeScanner for UdpScanner {
             }
             let Some(datagram) = self.receiver.next(until)? else { break };
             self.take(&datagram);
+            self.monitor.set_counts(self.counts);
             if self.completed.is_empty() && Instant::now() >= until {
                 break; // Even if invalid datagrams keep arriving.
             }

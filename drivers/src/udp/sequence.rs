@@ -75,8 +75,14 @@ impl SequenceTracker {
     }
 }
 
+/// Why a stamp is invalid, with a possible cause.
+pub(crate) fn rejection(header: &DatagramHeader, arrival: Stamp) -> String {
+    let (stamp_nanos, hint) = (header.stamp_nanos, hint(header, arrival));
+    format!("the stamp {stamp_nanos} is not after the previous one, or not recent{hint}")
+}
+
 /// Possible cause of an invalid stamp.
-pub(crate) fn hint(header: &DatagramHeader, arrival: Stamp) -> &'static str {
+fn hint(header: &DatagramHeader, arrival: Stamp) -> &'static str {
     match header.clock {
         Clock::Monotonic if Stamp(header.stamp_nanos) > arrival + MAX_AHEAD => {
             ": set \"clock\" to \"device\" unless stamps are of CLOCK_MONOTONIC on this computer"

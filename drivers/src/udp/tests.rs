@@ -223,6 +223,54 @@ fn only_one_sender_is_received_from() {
 }
 
 #[test]
+fn sender_with_a_new_socket_for_each_datagram_is_received_from() {
+    let names = ["shoulder".to_owned()];
+    let mut arm = UdpArm::open(&names, FREE_PORT.parse().unwrap()).unwrap();
+    assert!(arm.read(SHORT_TIMEOUT).is_err(), "older datagrams are discarded by the first read");
+    // All sockets stay open, so that their ports differ.
+    let sockets: Vec<_> = (0..30).map(|_| sender(arm.address())).collect();
+    for (seq, send) in (0..).zip(&sockets) {
+        let state = JointsDatagram { header: now(seq), position: vec![0.25], velocity: vec![], effort: vec![] };
+        send(&encode_joints(&state, &names));
+    }
+    for ix in 0..27 {
+        assert_eq!(arm.read(LONG_TIMEOUT).unwrap().position, [0.25], "{ix}");
+    }
+    assert!(arm.read(SHORT_TIMEOUT).is_err(), "three were ignored");
+    let expected = DatagramCounts { n_received: 30, n_foreign: 3, n_lost: 3, ..DatagramCounts::default() };
+    assert_eq!(arm.counts(), expected);
+}
+
+#[test]
+fn monitors_report_counts_and_the_last_rejection() {
+    let mut arm = UdpArm::open(&["shoulder".to_owned()], FREE_PORT.parse().unwrap()).unwrap();
+    let mut base = UdpBase::open(FREE_PORT.parse().unwrap(), MAX_SIGMA).unwrap();
+    let (mut scanner, send_scan) = scanner();
+    let monitors = [arm.monitor(), base.monitor(), scanner.monitor()];
+    assert_eq!(monitors.each_ref().map(|monitor| monitor.device()), ["arm", "base", "range scanner \"lidar\""]);
+    let addresses = [arm.address(), base.address(), scanner.address()];
+    assert_eq!(monitors.each_ref().map(|monitor| monitor.address()), addresses);
+    let mut read_all = || {
+        assert!(arm.read(SHORT_TIMEOUT).is_err() && base.next_pose(SHORT_TIMEOUT).is_err());
+        assert!(scanner.next_scan(SHORT_TIMEOUT).is_err());
+    };
+    read_all(); // The first read discards older datagrams.
+    assert!(monitors.iter().all(|monitor| monitor.counts().n_received == 0 && monitor.last_rejection().is_none()));
+    sender(addresses[0])(b"{\"kind\":\"joints\"}");
+    sender(addresses[1])(&pose(DatagramHeader { stamp_nanos: i64::MAX, ..now(0) }, 1.0));
+    send_scan(&part(DatagramHeader { stamp_nanos: i64::MAX, ..now(0) }, 0, 1, 1.0));
+    let started = Instant::now();
+    while monitors.iter().any(|monitor| monitor.counts().n_received == 0) {
+        read_all();
+        assert!(started.elapsed() < LONG_TIMEOUT, "{monitors:?}");
+    }
+    let expected = DatagramCounts { n_received: 1, n_rejected: 1, ..DatagramCounts::default() };
+    assert!(monitors.iter().all(|monitor| monitor.counts() == expected), "{monitors:?}");
+    let reasons = monitors.map(|monitor| monitor.last_rejection().unwrap());
+    assert!(!reasons[0].is_empty() && reasons[1..].iter().all(|reason| reason.contains("\"device\"")), "{reasons:?}");
+}
+
+#[test]
 fn live_merges_devices_and_names_silent_one() {
     let (scanner, send_scan) = scanner();
     let base = UdpBase::open(FREE_PORT.parse().unwrap(), MAX_SIGMA).unwrap();

@@ -3,7 +3,7 @@
 //! Source: `google/protobuf/descriptor.proto` for the encoding; the Foxglove schemas (docs.foxglove.dev/docs/sdk/schemas)
 //! for names and numbers. Fields from 1001 are our extensions.
 
-use super::protobuf::Message;
+use super::protobuf::{Message, fields};
 
 /// Names and numbers of one message type.
 #[derive(Clone, Copy, Debug)]
@@ -184,6 +184,12 @@ pub const POINT_CLOUD: Schema = Schema {
 };
 
 impl Schema {
+    /// Numbers of the fields of an encoded message that the schema does not have, in the order of the message.
+    pub fn unknown_fields(&self, message: &[u8]) -> Vec<u32> {
+        let is_unknown = |number: &u32| self.fields.iter().all(|field| field.number != *number);
+        fields(message).map_while(Result::ok).map(|field| field.number).filter(is_unknown).collect()
+    }
+
     /// The encoded `FileDescriptorSet`: the files that this message depends on, then its own file.
     pub fn file_descriptor_set(&self) -> Vec<u8> {
         let mut set = Message::default();
@@ -272,7 +278,6 @@ impl FieldSpec {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::wire::protobuf::fields;
 
     #[test]
     fn dependencies_precede_their_users() {
@@ -293,6 +298,13 @@ mod tests {
                 "foxglove/FrameTransform.proto"
             ]
         );
+    }
+
+    #[test]
+    fn fields_of_newer_versions_are_unknown() {
+        let mut message = Message::default();
+        message.double(1006, 42.0).bytes(2, b"world").varint(1099, 7).double(6, 1.0);
+        assert_eq!(FRAME_TRANSFORM.unknown_fields(&message.into_bytes()), [1099, 6]);
     }
 
     #[test]

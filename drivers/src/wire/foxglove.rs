@@ -6,8 +6,8 @@
 use super::protobuf::{Field, Message, fields};
 use super::{Malformed, descriptor};
 use crate::{Image, PixelFormat, YuvColors, YuvLayout, YuvMatrix, YuvRange};
+use kinematics::transform::{from_xyz_xyzw, to_xyz_xyzw};
 use kinematics::{Intrinsics, Lens, Stamp, Transform};
-use nalgebra::{Quaternion, Translation3, UnitQuaternion};
 use std::sync::Arc;
 
 const EXPOSURE_SECS: u32 = 1001;
@@ -32,6 +32,8 @@ const YUV_LAYOUTS: [(&str, YuvLayout); 5] = [
     ("yuv422_yuy2", YuvLayout::Yuyv),
     ("yuv422", YuvLayout::Uyvy),
 ];
+/// Encoding of depth in meters.
+const DEPTH_M: &str = "32FC1";
 const NANOS_PER_SEC: i64 = 1_000_000_000;
 
 /// The message type for images of this format.
@@ -93,7 +95,7 @@ fn raw_image(message: &mut Message, image: &Image, encoding: &str) {
         .bytes(7, image.camera.as_bytes());
 }
 
-/// Decodes an image from the message type given by [`schema_of`].
+/// Decodes an image from the message type given by [`schema_of`]. Removes the padding of rows.
 pub fn decode_image(schema: &str, bytes: &[u8]) -> Result<Image, Malformed> {
     let compressed = schema == descriptor::COMPRESSED_IMAGE.name;
     let mut stamp = None;
@@ -101,6 +103,7 @@ pub fn decode_image(schema: &str, bytes: &[u8]) -> Result<Image, Malformed> {
     let mut format = "";
     let mut meters_per_count = None;
     let mut colors = None;
+    let mut step = None;
     let mut image = Image {
         camera: Arc::from(""),
         stamp: Stamp::default(),
@@ -119,14 +122,18 @@ pub fn decode_image(schema: &str, bytes: &[u8]) -> Result<Image, Malformed> {
             (4, true) | (7, false) => image.camera = field.text()?.into(),
             (WIDTH_PX, true) | (2, false) => size_px[0] = field.fixed32()?,
             (HEIGHT_PX, true) | (3, false) => size_px[1] = field.fixed32()?,
+            (5, false) => step = Some(field.fixed32()?),
             (EXPOSURE_SECS, _) => image.exposure_secs = Some(field.double()?),
             (N_SKIPPED, _) => image.n_skipped = field.varint()?,
             (YUV_COLORS, false) => colors = Some(field.text()?),
             (METERS_PER_COUNT, false) => meters_per_count = Some(field.double()?),
-            _ => {} // Unknown fields of a newer version.
+            _ => {} // Unknown fields of a newer version, see `descriptor::Schema::unknown_fields`.
         }
     }
     image.stamp = stamp.ok_or(Malformed::Missing { name: "timestamp" })?;
+    if size_px.contains(&0) {
+        return Err(Malformed::Missing { name: if compressed { "width_px or height_px" } else { "width or height" } });
+    }
     image.size_px = size_px;
     image.format = match (format, compressed) {
         ("jpeg", true) => PixelFormat::Jpeg,
@@ -135,14 +142,37 @@ pub fn decode_image(schema: &str, bytes: &[u8]) -> Result<Image, Malformed> {
         ("bgr8", false) => PixelFormat::Bgr8,
         ("mono8", false) => PixelFormat::Gray8,
         ("16UC1", false) => PixelFormat::DepthU16 {
-            meters_per_count: meters_per_count.ok_or(Malformed::Missing { name: "meters_per_count" })?,
+            meters_per_count: positive(meters_per_count.ok_or(Malformed::Missing { name: "meters_per_count" })?)?,
         },
         (name, compressed) => match lookup(&YUV_LAYOUTS, name) {
             Some(layout) if !compressed => PixelFormat::Yuv { layout, colors: yuv_colors(colors)? },
             _ => return Err(Malformed::PixelFormat { name: name.to_owned() }),
         },
     };
-    Ok(image)
+    without_padding(image, step)
+}
+
+fn positive(meters_per_count: f64) -> Result<f64, Malformed> {
+    if meters_per_count > 0.0 && meters_per_count.is_finite() {
+        return Ok(meters_per_count);
+    }
+    let (found, expected) = (meters_per_count.to_string(), "a positive number".to_owned());
+    Err(Malformed::Unsupported { name: "meters_per_count", found, expected })
+}
+
+/// Removes the padding of rows whose starts are `step` bytes apart. This program writes rows without padding.
+fn without_padding(image: Image, step: Option<u32>) -> Result<Image, Malformed> {
+    let (Some(step), Some([row_bytes, _])) = (step, image.format.raw_size(image.size_px)) else { return Ok(image) };
+    let row_bytes = u32::try_from(row_bytes).unwrap_or(u32::MAX);
+    if step == row_bytes {
+        return Ok(image);
+    }
+    let n_bytes = image.data.len();
+    image.pack_rows(step as usize).map_err(|_| Malformed::Unsupported {
+        name: "step",
+        found: format!("{step}, with {n_bytes} bytes of data"),
+        expected: format!("at least {row_bytes} bytes, and data for all rows"),
+    })
 }
 
 fn yuv_colors(name: Option<&str>) -> Result<YuvColors, Malformed> {
@@ -154,21 +184,37 @@ fn yuv_colors(name: Option<&str>) -> Result<YuvColors, Malformed> {
 pub fn encode_depth_m(camera: &str, stamp: Stamp, size_px: [u32; 2], depth_m: &[f32]) -> Vec<u8> {
     let mut message = Message::with_capacity(depth_m.len() * 4 + 256);
     let data: Vec<u8> = depth_m.iter().flat_map(|depth_m| depth_m.to_le_bytes()).collect();
-    message.message(1, &timestamp(stamp)).fixed32(2, size_px[0]).fixed32(3, size_px[1]).bytes(4, b"32FC1");
+    message.message(1, &timestamp(stamp)).fixed32(2, size_px[0]).fixed32(3, size_px[1]).bytes(4, DEPTH_M.as_bytes());
     message.fixed32(5, size_px[0].saturating_mul(4)).bytes(6, &data).bytes(7, camera.as_bytes());
     message.into_bytes()
 }
 
 /// Decodes the depth in meters that [`encode_depth_m`] encoded.
 pub fn decode_depth_m(bytes: &[u8]) -> Result<Arc<[f32]>, Malformed> {
+    let (mut size_px, mut encoding, mut data) = ([0; 2], "", None);
     for field in fields(bytes) {
         let field = field?;
-        if field.number == 6 {
-            let meters = |bytes: &[u8]| f32::from_le_bytes([bytes[0], bytes[1], bytes[2], bytes[3]]);
-            return Ok(field.bytes()?.chunks_exact(4).map(meters).collect());
+        match field.number {
+            2 => size_px[0] = field.fixed32()?,
+            3 => size_px[1] = field.fixed32()?,
+            4 => encoding = field.text()?,
+            6 => data = Some(field.bytes()?),
+            _ => {}
         }
     }
-    Err(Malformed::Missing { name: "data" })
+    let data = data.ok_or(Malformed::Missing { name: "data" })?;
+    if encoding != DEPTH_M {
+        return Err(Malformed::PixelFormat { name: encoding.to_owned() });
+    }
+    let [width, height] = size_px;
+    if data.len() as u128 != 4 * u128::from(width) * u128::from(height) {
+        return Err(Malformed::Unsupported {
+            name: "data",
+            found: format!("{} bytes", data.len()),
+            expected: format!("4 bytes for each of {width} x {height} pixels"),
+        });
+    }
+    Ok(data.as_chunks::<4>().0.iter().map(|meters| f32::from_le_bytes(*meters)).collect())
 }
 
 /// Encodes intrinsics as a `CameraCalibration`.
@@ -194,19 +240,19 @@ pub fn encode_calibration(camera: &str, stamp: Stamp, intrinsics: &Intrinsics) -
 
 /// Encodes a pose as a `FrameTransform`.
 pub fn encode_transform(parent: &str, child: &str, stamp: Stamp, parent_from_child: &Transform) -> Vec<u8> {
-    let [x, y, z] = parent_from_child.translation.vector.into();
+    let [x, y, z, i, j, k, w] = to_xyz_xyzw(parent_from_child);
     let mut translation = Message::default();
     translation.double(1, x).double(2, y).double(3, z);
-    let quaternion = parent_from_child.rotation.quaternion();
     let mut rotation = Message::default();
-    rotation.double(1, quaternion.i).double(2, quaternion.j).double(3, quaternion.k).double(4, quaternion.w);
+    rotation.double(1, i).double(2, j).double(3, k).double(4, w);
     let mut message = Message::default();
     message.message(1, &timestamp(stamp)).bytes(2, parent.as_bytes()).bytes(3, child.as_bytes());
     message.message(4, &translation).message(5, &rotation);
     message.into_bytes()
 }
 
-/// Decodes stamp and pose from a `FrameTransform`, bit for bit.
+/// Decodes stamp and pose from a `FrameTransform`: poses of this program bit for bit. Quaternions of other programs may
+/// be rounded and are normalized.
 pub fn decode_transform(bytes: &[u8]) -> Result<(Stamp, Transform), Malformed> {
     let mut stamp = None;
     let mut translation = None;
@@ -222,10 +268,42 @@ pub fn decode_transform(bytes: &[u8]) -> Result<(Stamp, Transform), Malformed> {
     }
     let [x, y, z] = translation.ok_or(Malformed::Missing { name: "translation" })?;
     let [i, j, k, w] = rotation.ok_or(Malformed::Missing { name: "rotation" })?;
-    // Do not normalize again: that would change the last bit.
-    let rotation = UnitQuaternion::new_unchecked(Quaternion::new(w, i, j, k));
     let stamp = stamp.ok_or(Malformed::Missing { name: "timestamp" })?;
-    Ok((stamp, Transform::from_parts(Translation3::new(x, y, z), rotation)))
+    let [i, j, k, w] = unit_quaternion([i, j, k, w])?;
+    Ok((stamp, from_xyz_xyzw([x, y, z, i, j, k, w])))
+}
+
+/// Normalizes a quaternion, unless its length is 1 up to rounding: that would change its last bits. One that is not
+/// finite stays so, and the users of the pose reject it.
+fn unit_quaternion(quaternion: [f64; 4]) -> Result<[f64; 4], Malformed> {
+    /// Products of many rotations, and quaternions in f32, stay below it.
+    const EXACT: f64 = 1e-6;
+    /// Quaternions with two decimals stay below it.
+    const ROUNDED: f64 = 0.01;
+    let length = quaternion.iter().map(|number| number * number).sum::<f64>().sqrt();
+    let deviation = (length - 1.0).abs();
+    if !length.is_finite() || deviation <= EXACT {
+        return Ok(quaternion);
+    }
+    if deviation <= ROUNDED {
+        return Ok(quaternion.map(|number| number / length));
+    }
+    let (found, expected) = (format!("a quaternion of length {length}"), "one of length 1".to_owned());
+    Err(Malformed::Unsupported { name: "rotation", found, expected })
+}
+
+/// Decodes the names of the parent and the child of a `FrameTransform`; empty if they are absent.
+pub fn decode_frames(bytes: &[u8]) -> Result<[&str; 2], Malformed> {
+    let mut names = [""; 2];
+    for field in fields(bytes) {
+        let field = field?;
+        match field.number {
+            2 => names[0] = field.text()?,
+            3 => names[1] = field.text()?,
+            _ => {}
+        }
+    }
+    Ok(names)
 }
 
 /// Encodes a true camera pose in the world, with the maximum PSNR that the image noise allows, dB.
@@ -245,20 +323,20 @@ pub fn encode_true_pose(
     bytes
 }
 
-/// Decodes pose and PSNR ceiling that [`encode_true_pose`] encoded.
-pub fn decode_true_pose(bytes: &[u8]) -> Result<(Transform, Option<f64>), Malformed> {
-    let (_, world_from_camera) = decode_transform(bytes)?;
+/// Decodes stamp, pose and PSNR ceiling that [`encode_true_pose`] encoded.
+pub fn decode_true_pose(bytes: &[u8]) -> Result<(Stamp, Transform, Option<f64>), Malformed> {
+    let (stamp, world_from_camera) = decode_transform(bytes)?;
     for field in fields(bytes) {
         let field = field?;
         if field.number == PSNR_CEILING {
-            return Ok((world_from_camera, Some(field.double()?)));
+            return Ok((stamp, world_from_camera, Some(field.double()?)));
         }
     }
-    Ok((world_from_camera, None))
+    Ok((stamp, world_from_camera, None))
 }
 
 /// The doubles 1 to `N` of a message that has no other fields; absent ones are zero.
-fn numbers<const N: usize>(field: &Field<'_>) -> Result<[f64; N], Malformed> {
+pub(super) fn numbers<const N: usize>(field: &Field<'_>) -> Result<[f64; N], Malformed> {
     let mut numbers = [0.0; N];
     for inner in fields(field.bytes()?) {
         let inner = inner?;
@@ -286,15 +364,18 @@ pub(super) fn stamp_from(field: &Field<'_>) -> Result<Stamp, Malformed> {
             _ => {}
         }
     }
-    secs.checked_mul(NANOS_PER_SEC)
-        .and_then(|whole| whole.checked_add(nanos))
-        .map(Stamp)
-        .ok_or(Malformed::Range { field: field.number })
+    let out_of_range = Malformed::Range { field: field.number };
+    if !(0..NANOS_PER_SEC).contains(&nanos) {
+        return Err(out_of_range);
+    }
+    let whole = secs.checked_mul(NANOS_PER_SEC);
+    whole.and_then(|whole| whole.checked_add(nanos)).map(Stamp).ok_or(out_of_range)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use nalgebra::{Translation3, UnitQuaternion};
 
     fn image(format: PixelFormat) -> Image {
         Image {
@@ -333,11 +414,50 @@ mod tests {
         );
         let (stamp, read) = decode_transform(&encode_transform("world", "base", Stamp(5), &pose)).expect("own bytes");
         assert_eq!(stamp, Stamp(5));
-        let bits = |pose: &Transform| {
-            let rotation = pose.rotation.coords.iter().map(|number| number.to_bits());
-            pose.translation.vector.iter().map(|number| number.to_bits()).chain(rotation).collect::<Vec<_>>()
-        };
+        let bits = |pose: &Transform| to_xyz_xyzw(pose).map(f64::to_bits);
         assert_eq!(bits(&read), bits(&pose));
+    }
+
+    #[test]
+    fn rounded_quaternions_are_normalized_and_others_rejected() {
+        let sent = |w: f64| {
+            let mut pose = Message::default();
+            let mut rotation = Message::default();
+            rotation.double(1, 0.6).double(4, w);
+            pose.message(1, &timestamp(Stamp(3))).message(4, &Message::default()).message(5, &rotation);
+            decode_transform(&pose.into_bytes()).map(|(_, pose)| to_xyz_xyzw(&pose))
+        };
+        let exact = 0.8 + 1e-9;
+        assert_eq!(sent(exact), Ok([0.0, 0.0, 0.0, 0.6, 0.0, 0.0, exact]), "bit for bit");
+        let [.., x, _, _, w] = sent(0.805).expect("rounded");
+        assert!((x.hypot(w) - 1.0).abs() < 1e-12 && (w / x - 0.805 / 0.6).abs() < 1e-12, "{x} {w}");
+        for w in [0.0, 0.9, 1e9] {
+            let error = sent(w).expect_err("not a rotation").to_string();
+            assert!(error.starts_with("rotation is a quaternion of length "), "{error}");
+        }
+    }
+
+    #[test]
+    fn padding_of_rows_is_removed() {
+        let packed = Image { data: (0..18).collect(), ..image(PixelFormat::Rgb8) };
+        let with_step = |step: u32, data: &[u8]| {
+            let mut message = Message::default();
+            message.message(1, &timestamp(packed.stamp)).fixed32(2, 3).fixed32(3, 2).bytes(4, b"rgb8");
+            message
+                .fixed32(5, step)
+                .bytes(6, data)
+                .bytes(7, b"wrist")
+                .double(EXPOSURE_SECS, 0.004)
+                .varint(N_SKIPPED, 3);
+            decode_image("foxglove.RawImage", &message.into_bytes())
+        };
+        let rows = [&packed.data[..9], &[77; 3], &packed.data[9..], &[77; 3]].concat();
+        assert_eq!(with_step(12, &rows).as_ref(), Ok(&packed));
+        assert_eq!(with_step(9, &packed.data).as_ref(), Ok(&packed));
+        for (step, data) in [(8, &rows[..]), (12, &rows[..20]), (u32::MAX, &rows[..])] {
+            let error = with_step(step, data).expect_err("rows that do not fit").to_string();
+            assert!(error.starts_with(&format!("step is {step}, with ")), "{error}");
+        }
     }
 
     #[test]
@@ -345,6 +465,10 @@ mod tests {
         let depth_m = [0.0, 1.25, f32::NAN, f32::MIN_POSITIVE];
         let read = decode_depth_m(&encode_depth_m("wrist", Stamp(1), [2, 2], &depth_m)).expect("own bytes");
         assert!(read.iter().zip(depth_m).all(|(read, sent)| read.to_bits() == sent.to_bits()) && read.len() == 4);
+        let of_size = |size_px| decode_depth_m(&encode_depth_m("wrist", Stamp(1), size_px, &depth_m));
+        for size_px in [[2, 1], [u32::MAX; 2]] {
+            assert!(of_size(size_px).expect_err("another size").to_string().starts_with("data is 16 bytes"));
+        }
     }
 
     #[test]

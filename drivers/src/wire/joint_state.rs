@@ -2,7 +2,9 @@
 
 use super::Malformed;
 use kinematics::{JointState, Stamp};
+use serde::de::IgnoredAny;
 use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
 
 /// Name of the schema.
 pub const SCHEMA_NAME: &str = "fieldrig.JointState";
@@ -33,12 +35,15 @@ struct Wire {
 }
 
 #[derive(Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 struct Timestamp {
     sec: i64,
     nsec: u32,
 }
 
 const NANOS_PER_SEC: i64 = 1_000_000_000;
+/// The fields of [`Wire`].
+const FIELDS: [&str; 4] = ["timestamp", "position", "velocity", "effort"];
 
 /// Encodes joint states as JSON. Decoding restores finite numbers bit for bit, and others as NaN.
 pub fn encode(state: &JointState) -> Vec<u8> {
@@ -56,11 +61,9 @@ pub fn encode(state: &JointState) -> Vec<u8> {
 /// Decodes the joint state that [`encode`] encoded.
 pub fn decode(bytes: &[u8]) -> Result<JointState, Malformed> {
     let wire: Wire = serde_json::from_slice(bytes).map_err(|e| Malformed::Json { reason: e.to_string() })?;
-    let stamp = wire
-        .timestamp
-        .sec
-        .checked_mul(NANOS_PER_SEC)
-        .and_then(|whole| whole.checked_add(i64::from(wire.timestamp.nsec)));
+    let Timestamp { sec, nsec } = wire.timestamp;
+    let nanos = Some(i64::from(nsec)).filter(|nanos| *nanos < NANOS_PER_SEC);
+    let stamp = sec.checked_mul(NANOS_PER_SEC).zip(nanos).and_then(|(whole, nanos)| whole.checked_add(nanos));
     let numbers = |read: Vec<Option<f64>>| read.into_iter().map(|number| number.unwrap_or(f64::NAN)).collect();
     Ok(JointState {
         stamp: stamp.map(Stamp).ok_or_else(|| Malformed::Json { reason: "the timestamp is out of range".into() })?,
@@ -68,6 +71,12 @@ pub fn decode(bytes: &[u8]) -> Result<JointState, Malformed> {
         velocity: numbers(wire.velocity),
         effort: numbers(wire.effort),
     })
+}
+
+/// Names of the fields of a message that [`decode`] does not read, in alphabetical order.
+pub fn unknown_fields(bytes: &[u8]) -> Vec<String> {
+    let fields: BTreeMap<String, IgnoredAny> = serde_json::from_slice(bytes).unwrap_or_default();
+    fields.into_keys().filter(|name| !FIELDS.contains(&name.as_str())).collect()
 }
 
 #[cfg(test)]
@@ -93,6 +102,19 @@ mod tests {
         let sent = JointState { stamp: Stamp(1), position: vec![f64::NAN, 1.0], velocity: vec![], effort: vec![] };
         let read = decode(&encode(&sent)).expect("own bytes");
         assert!(read.position[0].is_nan() && read.position[1] == 1.0);
+    }
+
+    #[test]
+    fn unknown_fields_are_named() {
+        let sent = JointState { stamp: Stamp(1), position: vec![1.0], velocity: vec![], effort: vec![] };
+        let text = String::from_utf8(encode(&sent)).expect("text");
+        assert_eq!(unknown_fields(text.as_bytes()), [""; 0]);
+        let more = text.replacen('{', r#"{"names":["a"],"frame_id":"arm","#, 1);
+        assert_eq!(decode(more.as_bytes()), Ok(sent));
+        assert_eq!(unknown_fields(more.as_bytes()), ["frame_id", "names"]);
+        assert!(decode(text.replace("nsec", "nanosec").as_bytes()).is_err());
+        let error = decode(text.replace(r#""nsec":1"#, r#""nsec":1000000000"#).as_bytes()).expect_err("too large");
+        assert_eq!(error.to_string(), "the timestamp is out of range");
     }
 
     #[test]

@@ -48,6 +48,16 @@ pub enum Malformed {
         /// Name of the pixel format.
         name: String,
     },
+    /// A field has a value that contradicts the rest of the message or is not supported.
+    #[error("{name} is {found}, expected {expected}")]
+    Unsupported {
+        /// Name of the field.
+        name: &'static str,
+        /// Value found.
+        found: String,
+        /// Values allowed.
+        expected: String,
+    },
     /// The JSON does not match its schema.
     #[error("{reason}")]
     Json {

@@ -4,8 +4,8 @@
 //! the stamp as u32. The encoding is lossless.
 
 use super::Malformed;
-use super::foxglove::{stamp_from, timestamp};
-use super::protobuf::{Message, fields};
+use super::foxglove::{numbers, stamp_from, timestamp};
+use super::protobuf::{Field, Message, fields};
 use crate::{RangePoint, RangeScan};
 use std::sync::Arc;
 
@@ -47,12 +47,15 @@ fn identity() -> Message {
 /// Decodes the scan that [`encode`] encoded. A cloud with another layout is an error.
 pub fn decode(bytes: &[u8]) -> Result<RangeScan, Malformed> {
     let (mut stamp, mut scanner, mut stride, mut points) = (None, Arc::from(""), None, None);
+    let mut layout = Vec::new();
     for field in fields(bytes) {
         let field = field?;
         match field.number {
             1 => stamp = Some(stamp_from(&field)?),
             2 => scanner = field.text()?.into(),
+            3 => expect_identity(&field)?,
             4 => stride = Some(field.fixed32()?),
+            5 => layout.push(point_field(&field)?),
             6 => points = Some(field.bytes()?),
             _ => {}
         }
@@ -61,8 +64,49 @@ pub fn decode(bytes: &[u8]) -> Result<RangeScan, Malformed> {
     if stride != Some(STRIDE) || data.len() % STRIDE as usize != 0 {
         return Err(Malformed::Range { field: 4 });
     }
+    if layout != FIELDS {
+        return Err(Malformed::Unsupported { name: "fields", found: described(&layout), expected: described(&FIELDS) });
+    }
     let stamp = stamp.ok_or(Malformed::Missing { name: "timestamp" })?;
     Ok(RangeScan { scanner, stamp, points: data.as_chunks::<{ STRIDE as usize }>().0.iter().map(point).collect() })
+}
+
+/// Rejects points in another frame than that of the scanner.
+fn expect_identity(pose: &Field<'_>) -> Result<(), Malformed> {
+    let (mut position, mut orientation) = ([0.0; 3], [0.0, 0.0, 0.0, 1.0]);
+    for field in fields(pose.bytes()?) {
+        let field = field?;
+        match field.number {
+            1 => position = numbers(&field)?,
+            2 => orientation = numbers(&field)?,
+            _ => {}
+        }
+    }
+    if position == [0.0; 3] && orientation == [0.0, 0.0, 0.0, 1.0] {
+        return Ok(());
+    }
+    let found = format!("{position:?} m, quaternion {orientation:?}");
+    Err(Malformed::Unsupported { name: "pose", found, expected: "the identity".to_owned() })
+}
+
+/// Name, offset and type of one `PackedElementField`.
+fn point_field<'a>(field: &Field<'a>) -> Result<(&'a str, u32, u64), Malformed> {
+    let (mut name, mut offset, mut kind) = ("", 0, 0);
+    for inner in fields(field.bytes()?) {
+        let inner = inner?;
+        match inner.number {
+            1 => name = inner.text()?,
+            2 => offset = inner.fixed32()?,
+            3 => kind = inner.varint()?,
+            _ => {}
+        }
+    }
+    Ok((name, offset, kind))
+}
+
+fn described(layout: &[(&str, u32, u64)]) -> String {
+    let field = |(name, offset, kind): &(&str, u32, u64)| format!("{name} at {offset} of type {kind}");
+    if layout.is_empty() { "absent".to_owned() } else { layout.iter().map(field).collect::<Vec<_>>().join(", ") }
 }
 
 fn point(bytes: &[u8; STRIDE as usize]) -> RangePoint {
@@ -98,5 +142,28 @@ mod tests {
         other.message(1, &timestamp(Stamp(1))).fixed32(4, 16).bytes(6, &[0; 32]);
         assert_eq!(decode(&other.into_bytes()), Err(Malformed::Range { field: 4 }));
         assert_eq!(decode(&[]), Err(Malformed::Missing { name: "data" }));
+    }
+
+    #[test]
+    fn other_poses_and_fields_are_named() {
+        let scan = RangeScan { scanner: "lidar".into(), stamp: Stamp(5), points: [].into() };
+        let changed = |change: &Message| {
+            // Fields of a message may be in any order, so that encoded parts can be concatenated.
+            decode(&[encode(&scan), change.clone().into_bytes()].concat()).map_err(|error| error.to_string())
+        };
+        let (mut position, mut pose, mut at) = (Message::default(), Message::default(), Message::default());
+        position.double(3, 0.5);
+        pose.message(1, &position);
+        at.message(3, &pose);
+        assert_eq!(
+            changed(&at),
+            Err("pose is [0.0, 0.0, 0.5] m, quaternion [0.0, 0.0, 0.0, 1.0], expected the identity".to_owned())
+        );
+        let (mut intensity, mut more) = (Message::default(), Message::default());
+        intensity.bytes(1, b"intensity").fixed32(2, 12).varint(3, 7);
+        more.message(5, &intensity);
+        let error = changed(&more).expect_err("another layout");
+        assert!(error.starts_with("fields is x at 0 of type 7, ") && error.contains("intensity at 12 of"), "{error}");
+        assert_eq!(changed(&Message::default()), Ok(scan.clone()));
     }
 }

@@ -64,7 +64,7 @@ pub fn check_target_file(file: &Path) -> Result<(), Error> {
 
 /// Whether a file exists that is neither empty nor a report.
 fn is_other_file(file: &Path) -> bool {
-    match files::read(file, files::MAX_TEXT_BYTES) {
+    match files::read(file, files::Budget::TEXT) {
         Ok(bytes) => !bytes.is_empty() && !String::from_utf8_lossy(&bytes).contains(page::SUBTITLE),
         Err(_) => false,
     }

@@ -3,7 +3,76 @@
 use super::transform_of;
 use crate::exit::BadArgument;
 use kinematics::Transform;
+use serde::de::{Deserialize, Deserializer, Error as _, MapAccess, SeqAccess, Visitor};
 use serde_json::{Map, Value};
+use std::fmt::Formatter;
+
+/// Parses JSON. A key that occurs twice in one object is an error: otherwise, only its last value would be used.
+pub(super) fn parse(text: &str) -> serde_json::Result<Value> {
+    serde_json::from_str(text).map(|Unique(value)| value)
+}
+
+/// A value whose objects have no repeated keys.
+struct Unique(Value);
+
+impl<'de> Deserialize<'de> for Unique {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        deserializer.deserialize_any(UniqueVisitor).map(Self)
+    }
+}
+
+struct UniqueVisitor;
+
+impl<'de> Visitor<'de> for UniqueVisitor {
+    type Value = Value;
+
+    fn expecting(&self, formatter: &mut Formatter<'_>) -> std::fmt::Result {
+        formatter.write_str("a value")
+    }
+
+    fn visit_unit<E>(self) -> Result<Value, E> {
+        Ok(Value::Null)
+    }
+
+    fn visit_bool<E>(self, value: bool) -> Result<Value, E> {
+        Ok(value.into())
+    }
+
+    fn visit_i64<E>(self, value: i64) -> Result<Value, E> {
+        Ok(value.into())
+    }
+
+    fn visit_u64<E>(self, value: u64) -> Result<Value, E> {
+        Ok(value.into())
+    }
+
+    fn visit_f64<E>(self, value: f64) -> Result<Value, E> {
+        Ok(value.into())
+    }
+
+    fn visit_str<E>(self, value: &str) -> Result<Value, E> {
+        Ok(value.into())
+    }
+
+    fn visit_seq<A: SeqAccess<'de>>(self, mut list: A) -> Result<Value, A::Error> {
+        let mut values = Vec::new();
+        while let Some(Unique(value)) = list.next_element()? {
+            values.push(value);
+        }
+        Ok(values.into())
+    }
+
+    fn visit_map<A: MapAccess<'de>>(self, mut object: A) -> Result<Value, A::Error> {
+        let mut map = Map::new();
+        while let Some((key, Unique(value))) = object.next_entry::<String, Unique>()? {
+            if map.contains_key(&key) {
+                return Err(A::Error::custom(format_args!("the key {key:?} occurs twice; keep one of them")));
+            }
+            map.insert(key, value);
+        }
+        Ok(map.into())
+    }
+}
 
 /// An object in a JSON file.
 #[derive(Clone, Debug)]
@@ -113,6 +182,19 @@ mod tests {
 
     fn error<T>(result: Result<T, BadArgument>) -> String {
         result.err().expect("an error").to_string()
+    }
+
+    #[test]
+    fn repeated_keys_are_refused_and_other_json_is_read_unchanged() {
+        let text = r#"{"a": [null, true, -7, 18446744073709551615, 0.1, "text", {"a": {}}], "b": {"a": []}}"#;
+        let expected: Value = serde_json::from_str(text).expect("JSON");
+        assert_eq!(parse(text).expect("JSON"), expected);
+        for (text, line) in [(r#"{"a": 1, "a": 1}"#, 1), ("[{},\n{\"b\": {\"a\": 1, \"c\": 2,\n\"a\": 2}}]", 3)] {
+            let error = parse(text).expect_err("a repeated key").to_string();
+            let expected = format!("the key \"a\" occurs twice; keep one of them at line {line} column ");
+            assert!(error.starts_with(&expected), "{error}");
+        }
+        assert!(parse(r#"{"a": 1e999}"#).is_err() && parse("{} {}").is_err());
     }
 
     #[test]

@@ -63,9 +63,12 @@ impl LensFile {
             Some([width, height]) => Some([side(width)?, side(height)?]),
             None => None,
         };
-        let model = match object.text("model")? {
-            Some(model) => Some(model),
-            None => object.text("lens")?,
+        let model = match (object.text("model")?, object.text("lens")?) {
+            (Some(model), Some(lens)) if model != lens => {
+                let why = format!("{lens:?}, but model is {model:?}; both mean the lens model: keep one of them");
+                return Err(object.invalid("lens", why));
+            }
+            (model, lens) => model.or(lens),
         };
         Ok(Self {
             model: model.map(str::to_owned),
@@ -74,7 +77,9 @@ impl LensFile {
             principal_px: object.required("principal_px", object.array("principal_px")?)?,
             distortion: object.numbers("distortion")?.unwrap_or_default(),
             covariance: object.numbers("covariance")?.unwrap_or_default(),
-            sigmas: object.object("sigma", &all_names())?.map_or(Ok(Vec::new()), |sigma| sigmas(&sigma, model))?,
+            sigmas: object
+                .object("sigma", &param_names(model))?
+                .map_or(Ok(Vec::new()), |sigma| sigmas(&sigma, model))?,
         })
     }
 
@@ -101,18 +106,36 @@ impl LensFile {
         Self { covariance: covariance.as_slice().to_vec(), ..self }
     }
 
-    /// Covariance of [`Intrinsics::params`]. With standard deviations only, the parameters count as independent.
+    /// Covariance of [`Intrinsics::params`]. With standard deviations only, the parameters count as independent, and those
+    /// without one as exact.
     pub(super) fn covariance(&self, intrinsics: &Intrinsics) -> Result<Option<DMatrix<f64>>, BadArgument> {
-        if !self.covariance.is_empty() || self.sigmas.is_empty() {
-            return covariance_of(&self.covariance, intrinsics)
-                .map_err(|error| BadArgument(format!("intrinsics.covariance: {error}")));
-        }
         let n = intrinsics.params().len();
-        let mut covariance = DMatrix::zeros(n, n);
-        for (ix, sigma) in self.sigmas.iter().filter(|(ix, _)| *ix < n) {
-            covariance[(*ix, *ix)] = sigma * sigma;
+        let name = |ix: usize| param_names(self.model.as_deref())[ix];
+        if let Some((ix, _)) = self.sigmas.iter().find(|(ix, _)| *ix >= n) {
+            let params = param_names(self.model.as_deref())[..n].join(", ");
+            return Err(BadArgument(format!("intrinsics.sigma.{}: the lens has only {params}", name(*ix))));
         }
-        Ok(Some(covariance))
+        let given = covariance_of(&self.covariance, intrinsics)
+            .map_err(|error| BadArgument(format!("intrinsics.covariance: {error}")))?;
+        let Some(given) = given else {
+            let mut independent = DMatrix::zeros(n, n);
+            for (ix, sigma) in &self.sigmas {
+                independent[(*ix, *ix)] = sigma * sigma;
+            }
+            return Ok((!self.sigmas.is_empty()).then_some(independent));
+        };
+        /// Relative difference of two standard deviations that are meant to be equal; they may be rounded.
+        const MAX_DIFFERENCE: f64 = 0.01;
+        for (ix, sigma) in &self.sigmas {
+            let of_covariance = given[(*ix, *ix)].max(0.0).sqrt();
+            if (sigma - of_covariance).abs() > MAX_DIFFERENCE * sigma.max(of_covariance) {
+                return Err(BadArgument(format!(
+                    "intrinsics.sigma.{} is {sigma}, but intrinsics.covariance means {of_covariance}; remove the wrong one",
+                    name(*ix)
+                )));
+            }
+        }
+        Ok(Some(given))
     }
 
     /// The intrinsics for images of the given size.
@@ -189,15 +212,16 @@ const PLANE_NAMES: [&str; 4] = ["fx", "fy", "cx", "cy"];
 const BROWN_CONRADY_NAMES: [&str; 8] = ["k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"];
 const KANNALA_BRANDT_NAMES: [&str; 4] = ["k1", "k2", "k3", "k4"];
 
-fn all_names() -> Vec<&'static str> {
-    PLANE_NAMES.into_iter().chain(BROWN_CONRADY_NAMES).collect()
+/// Names of the parameters of a lens model, in the order of [`Intrinsics::params`]. A lens may have only the first ones.
+pub(super) fn param_names(model: Option<&str>) -> Vec<&'static str> {
+    let coefficients: &[&str] =
+        if model == Some(KANNALA_BRANDT) { &KANNALA_BRANDT_NAMES } else { &BROWN_CONRADY_NAMES };
+    PLANE_NAMES.iter().chain(coefficients).copied().collect()
 }
 
 /// Standard deviations with the indices of their parameters.
 fn sigmas(sigma: &JsonObject<'_>, model: Option<&str>) -> Result<Vec<(usize, f64)>, BadArgument> {
-    let coefficients: &[&str] =
-        if model == Some(KANNALA_BRANDT) { &KANNALA_BRANDT_NAMES } else { &BROWN_CONRADY_NAMES };
-    let names = PLANE_NAMES.iter().chain(coefficients).enumerate();
+    let names = param_names(model).into_iter().enumerate();
     let given = names.filter_map(|(ix, name)| sigma.get(name).map(|value| (ix, name, value)));
     given
         .map(|(ix, name, value)| match value.as_f64().filter(|value| *value >= 0.0) {

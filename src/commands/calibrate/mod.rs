@@ -74,29 +74,17 @@ fn print_matrix(matrix: &[[f64; 4]; 4]) -> anyhow::Result<()> {
 /// The transform of a matrix in JSON: four lists of four numbers, or one list of 16, row by row.
 fn transform_of(value: &serde_json::Value) -> Result<Transform, String> {
     let rows = value.as_array().map_or(0, Vec::len);
-    let flat: Vec<&serde_json::Value> = match value.as_array() {
-        Some(rows) => {
-            rows.iter().flat_map(|row| row.as_array().map_or(vec![row], |row| row.iter().collect())).collect()
-        }
-        None => Vec::new(),
+    let row_of = |row: &serde_json::Value| row.as_array().filter(|row| row.len() == 4).cloned();
+    let given = value.as_array().cloned().unwrap_or_default();
+    let flat = match given.iter().map(row_of).collect::<Option<Vec<_>>>() {
+        Some(rows) => rows.concat(),
+        None => given,
     };
-    let numbers: Option<Vec<f64>> = flat.into_iter().map(serde_json::Value::as_f64).collect();
+    let numbers: Option<Vec<f64>> = flat.iter().map(serde_json::Value::as_f64).collect();
     let numbers: Option<[f64; 16]> = numbers.and_then(|numbers| numbers.try_into().ok());
     let numbers = numbers.ok_or_else(|| match rows {
         1..=3 => format!("must be a matrix of 4 x 4 numbers, row by row; found {rows} rows"),
         _ => "must be a matrix of 4 x 4 numbers, row by row".to_owned(),
     })?;
-    transform::from_rows(&numbers).map_err(|error| {
-        let rotation = nalgebra::Matrix3::from_fn(|row, column| numbers[4 * row + column]);
-        let deviation = (rotation.transpose() * rotation - nalgebra::Matrix3::identity()).amax();
-        const ROUNDED: f64 = 0.02;
-        if deviation < ROUNDED && rotation.determinant() < 0.0 {
-            "the rotation is mirrored (its determinant is -1), expected right-handed axes; check the sign of each axis"
-                .to_owned()
-        } else if deviation < ROUNDED {
-            format!("{error}; if the numbers were rounded, write at least six decimals")
-        } else {
-            error.to_string()
-        }
-    })
+    transform::from_rows(&numbers).map_err(|error| error.to_string())
 }

@@ -1,12 +1,14 @@
 //! A set of cells of a grid over all space.
 
-use super::{GROUPS_PER_EDIT, rows};
+use super::{GROUPS_PER_EDIT, MAX_COORD_M, rows};
 use crate::nerf::reference::space::contract;
 use nalgebra::{Matrix4, Vector3};
 use serde::{Deserialize, Serialize};
 
 /// Maximum number of cells along an axis; indices have 30 bits.
-pub(super) const MAX_CELLS: u32 = 1024;
+const MAX_CELLS: u32 = 1024;
+/// Smallest radius of the cube with equal cells, meters. Its inverse times any coordinate is finite in f32.
+const MIN_RADIUS_M: f64 = 1e-6;
 
 /// A grid of cells that covers all space: cubes of equal size within a radius, and larger ones outside, as in a
 /// contracted neural field (Barron et al. 2022).
@@ -123,6 +125,26 @@ impl CellSet {
             }
         }
         Self { grid, ranges }
+    }
+
+    /// Checks that kernels can compute with the set. The error is a sentence without a period.
+    pub(super) fn check(&self) -> Result<(), String> {
+        let Self { grid, ranges } = self;
+        let CellGrid { center_m, radius_m, n_cells } = grid;
+        // The comparisons are written so that NaN fails them.
+        let is_near = center_m.iter().all(|along| along.abs() <= MAX_COORD_M);
+        if !(is_near && (MIN_RADIUS_M..=MAX_COORD_M).contains(radius_m) && (1..=MAX_CELLS).contains(n_cells)) {
+            return Err(format!(
+                "invalid grid of erased cells: {grid:?}, expected coordinates up to {MAX_COORD_M:e} m, a radius from \
+                 {MIN_RADIUS_M:e} m to {MAX_COORD_M:e} m and 1 to {MAX_CELLS} cells"
+            ));
+        }
+        let end = n_cells.pow(3);
+        let is_ordered = ranges.windows(2).all(|pair| pair[0][1] <= pair[1][0]);
+        if ranges.is_empty() || !is_ordered || ranges.iter().any(|[first, after]| first >= after || *after > end) {
+            return Err(format!("erased cells need at least one range, in increasing order, disjoint and up to {end}"));
+        }
+        Ok(())
     }
 
     /// Whether the set contains a point in world.

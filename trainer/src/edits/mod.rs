@@ -17,11 +17,14 @@ pub(crate) use groups::Groups;
 use crate::{Aabb, Error};
 use nalgebra::Matrix4;
 use serde::{Deserialize, Serialize};
+use std::io::ErrorKind;
 use std::path::Path;
 use stored::StoredEdit;
 
 /// Maximum number of edits of a model.
 pub const MAX_EDITS: usize = 64;
+/// Largest absolute coordinate of an edit, meters. Products of such numbers are finite in f32.
+const MAX_COORD_M: f64 = 1e9;
 /// Name of the file in a model folder.
 const FILE: &str = "edits.json";
 /// Words of an edit in [`Edits::words`], in groups of four.
@@ -44,6 +47,30 @@ impl Edit {
             Self::Cells(cells) => cells.contains(point_m),
         }
     }
+
+    /// Checks that kernels can compute with the edit. The error is a sentence without a period.
+    fn check(&self) -> Result<(), String> {
+        match self {
+            Self::Box(aabb) => check_box(aabb),
+            Self::Cells(cells) => cells.check(),
+        }
+    }
+}
+
+fn check_box(Aabb { world_from_box, min_m, max_m }: &Aabb) -> Result<(), String> {
+    // The comparisons are written so that NaN fails them.
+    let is_increasing = (0..3).all(|axis| min_m[axis] < max_m[axis]);
+    if !is_increasing {
+        return Err(format!("an erased box from {min_m:?} to {max_m:?}, expected increasing corners"));
+    }
+    let origin_m: [f64; 3] = world_from_box.translation.vector.into();
+    let is_near = [&origin_m, min_m, max_m].into_iter().flatten().all(|along| along.abs() <= MAX_COORD_M);
+    if !is_near {
+        return Err(format!(
+            "an erased box at {origin_m:?} from {min_m:?} to {max_m:?} m, expected coordinates up to {MAX_COORD_M:e} m"
+        ));
+    }
+    Ok(())
 }
 
 /// The edits of a model, oldest first.
@@ -63,11 +90,12 @@ impl Edits {
     ///
     /// # Errors
     ///
-    /// Fails if there are [`MAX_EDITS`] already.
+    /// Fails if there are [`MAX_EDITS`] already, or if the edit is too large or too far away to be computed with.
     pub fn push(&mut self, edit: Edit) -> Result<(), Error> {
         if self.0.len() >= MAX_EDITS {
             return Err(Error::TooManyEdits);
         }
+        edit.check().map_err(|reason| Error::InvalidEdit { reason })?;
         self.0.push(edit);
         Ok(())
     }
@@ -106,13 +134,14 @@ impl Edits {
     /// Fails if the file cannot be read or is damaged.
     pub fn read(model: &Path) -> Result<Self, Error> {
         let path = model.join(FILE);
-        if !path.is_file() {
+        // Anything else with this name, such as a broken link, is an error: erased parts would return without it.
+        if let Err(error) = path.symlink_metadata()
+            && matches!(error.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory)
+        {
             return Ok(Self::default());
         }
-        let bytes =
-            files::read(&path, files::MAX_TEXT_BYTES).map_err(|source| Error::Read { path: path.clone(), source })?;
-        let file: File =
-            serde_json::from_slice(&bytes).map_err(|source| Error::ModelMetadata { path: path.clone(), source })?;
+        let text = files::read_text(&path).map_err(|source| Error::Read { path: path.clone(), source })?;
+        let file: File = serde_json::from_str(&text).map_err(|source| Error::ModelMetadata { path, source })?;
         Ok(file.edits)
     }
 

@@ -1,6 +1,6 @@
 //! The form of edits in files. `docs/reference/files.md` describes it.
 
-use super::cells::{CellGrid, CellSet, MAX_CELLS};
+use super::cells::{CellGrid, CellSet};
 use super::{Edit, Edits, MAX_EDITS};
 use crate::Aabb;
 use kinematics::transform::{from_rows, to_rows};
@@ -41,33 +41,14 @@ impl TryFrom<StoredEdit> for Edit {
     type Error = String;
 
     fn try_from(stored: StoredEdit) -> Result<Self, String> {
-        match stored {
+        let edit = match stored {
             StoredEdit::Box { world_from_box, min_m, max_m } => {
                 let world_from_box = from_rows(&world_from_box).map_err(|error| error.to_string())?;
-                let is_valid = (0..3).all(|axis| min_m[axis] < max_m[axis]);
-                if !is_valid {
-                    return Err(format!("an erased box from {min_m:?} to {max_m:?}, expected increasing corners"));
-                }
-                Ok(Self::Box(Aabb { world_from_box, min_m, max_m }))
+                Self::Box(Aabb { world_from_box, min_m, max_m })
             }
-            StoredEdit::Cells { grid, ranges } => {
-                check_cells(&grid, &ranges)?;
-                Ok(Self::Cells(CellSet { grid, ranges }))
-            }
-        }
+            StoredEdit::Cells { grid, ranges } => Self::Cells(CellSet { grid, ranges }),
+        };
+        edit.check()?;
+        Ok(edit)
     }
-}
-
-fn check_cells(grid: &CellGrid, ranges: &[[u32; 2]]) -> Result<(), String> {
-    let CellGrid { center_m, radius_m, n_cells } = grid;
-    let is_finite = center_m.iter().all(|along| along.is_finite()) && radius_m.is_finite() && *radius_m > 0.0;
-    if !is_finite || !(1..=MAX_CELLS).contains(n_cells) {
-        return Err(format!("invalid grid of erased cells: {grid:?}"));
-    }
-    let end = n_cells.pow(3);
-    let is_ordered = ranges.windows(2).all(|pair| pair[0][1] <= pair[1][0]);
-    if ranges.is_empty() || !is_ordered || ranges.iter().any(|[first, after]| first >= after || *after > end) {
-        return Err(format!("erased cells need at least one range, in increasing order, disjoint and up to {end}"));
-    }
-    Ok(())
 }

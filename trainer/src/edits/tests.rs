@@ -4,7 +4,9 @@ use super::{CellGrid, CellLabels, CellMask, CellSet, Edit, Edits, Groups, MAX_ED
 use crate::{Aabb, Error};
 use kinematics::Transform;
 use nalgebra::Vector3;
+use serde_json::{Value, json};
 use std::collections::BTreeSet;
+use std::path::Path;
 
 const GRID: CellGrid = CellGrid { center_m: [1.0, 0.0, -2.0], radius_m: 0.5, n_cells: 40 };
 
@@ -115,4 +117,130 @@ fn damaged_files_are_rejected_with_the_reason() {
     }
     let one = format!(r#"{{"cells": {{{grid}, "ranges": [[0, 1]]}}}}"#);
     assert!(error_of(&format!("[{}]", vec![one; 65].join(","))).contains("at most 64"));
+}
+
+/// A file with a box and a set of cells.
+fn valid_file() -> Value {
+    let world_from_box = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1];
+    let grid = json!({"center_m": [10, 0, 0], "radius_m": 1, "n_cells": 10});
+    json!({"edits": [
+        {"box": {"world_from_box": world_from_box, "min_m": [0, 0, 0], "max_m": [1, 1, 1]}},
+        {"cells": {"grid": grid, "ranges": [[0, 1]]}},
+    ]})
+}
+
+/// Reads a file with these contents. The error includes its cause.
+fn read(folder: &Path, file: &Value) -> Result<Edits, String> {
+    std::fs::write(folder.join("edits.json"), file.to_string()).unwrap();
+    Edits::read(folder).map_err(|error| format!("{error}: {}", std::error::Error::source(&error).unwrap()))
+}
+
+/// Which points of a lattice are erased, near the edits of [`valid_file`] and far away.
+fn erased(edits: &Edits) -> Vec<bool> {
+    const ALONG_M: [f64; 11] = [-1e4, -100.0, -20.0, -5.0, -1.0, 0.5, 1.5, 3.0, 9.5, 12.0, 50.0];
+    let points = ALONG_M.into_iter().flat_map(|x| ALONG_M.into_iter().flat_map(move |y| ALONG_M.map(|z| [x, y, z])));
+    points.map(|point_m| edits.erases(point_m)).collect()
+}
+
+/// A field of the table in docs/reference/files.md, a valid value, and invalid values with words of their errors.
+type Case = (&'static str, Value, Vec<(Value, &'static str)>);
+
+fn cases() -> [Case; 8] {
+    let at = |x: f64| json!([1, 0, 0, x, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]);
+    let scaled = json!([2, 0, 0, 0, 0, 2, 0, 0, 0, 0, 2, 0, 0, 0, 0, 1]);
+    let one = valid_file()["edits"][0].clone();
+    [
+        ("edits", json!([one]), vec![(vec![one; 65].into(), "at most 64"), (json!({}), "invalid type")]),
+        ("box.world_from_box", at(-2.0), vec![(scaled, "not rigid"), (at(1e10), "1e9 m"), (json!([1]), "16")]),
+        ("box.min_m", json!([-2, -2, -2]), vec![(json!([1, 0, 0]), "corners"), (json!([-1e300, 0, 0]), "1e9 m")]),
+        ("box.max_m", json!([4, 4, 4]), vec![(json!([-1, 1, 1]), "corners"), (json!([1, 1, 1.1e9]), "1e9 m")]),
+        ("cells.grid.center_m", json!([60, 0, 0]), vec![(json!([0, -1e10, 0]), "1e9 m"), (json!([0, 0]), "3")]),
+        (
+            "cells.grid.radius_m",
+            json!(60),
+            [0.0, -1.0, 1e-7, 1e10].map(|radius_m| (json!(radius_m), "a radius from 1e-6 m to 1e9 m")).to_vec(),
+        ),
+        (
+            "cells.grid.n_cells",
+            json!(5),
+            vec![(json!(0), "1 to 1024"), (json!(1025), "1 to 1024"), (json!(-1), "u32"), (json!(2.5), "u32")],
+        ),
+        (
+            "cells.ranges",
+            json!([[0, 1000]]),
+            vec![
+                (json!([]), "at least one range"),
+                (json!([[5, 5]]), "increasing"),
+                (json!([[5, 7], [6, 8]]), "disjoint"),
+                (json!([[0, 1001]]), "up to 1000"),
+                (json!([[0]]), "2"),
+            ],
+        ),
+    ]
+}
+
+/// Changes each field alone.
+#[test]
+fn every_documented_field_is_used_and_other_values_are_refused() {
+    let page = include_str!("../../../docs/reference/files.md");
+    let section = page.split("### `edits.json`").nth(1).and_then(|rest| rest.split("\n##").next()).unwrap();
+    let rows = section.lines().filter_map(|line| line.strip_prefix("| `")?.split('`').next());
+    assert_eq!(rows.collect::<Vec<_>>(), cases().each_ref().map(|(field, ..)| *field));
+    let folder = tempfile::tempdir().unwrap();
+    let unchanged = erased(&read(folder.path(), &valid_file()).unwrap());
+    for (field, valid, invalid) in cases() {
+        let kind = usize::from(field.starts_with("cells"));
+        let pointer =
+            if field == "edits" { "/edits".to_owned() } else { format!("/edits/{kind}/{}", field.replace('.', "/")) };
+        let with = |value: &Value| {
+            let mut file = valid_file();
+            *file.pointer_mut(&pointer).unwrap() = value.clone();
+            read(folder.path(), &file)
+        };
+        assert_ne!(erased(&with(&valid).unwrap()), unchanged, "{field}");
+        for (value, words) in invalid.iter().chain(&[(Value::Null, "null"), ("1".into(), "string")]) {
+            let error = with(value).unwrap_err();
+            assert!(error.contains(words) && error.contains("edits.json"), "{field} is {value}: {error}");
+        }
+        let mut without = valid_file();
+        let (parent, key) = pointer.rsplit_once('/').unwrap();
+        without.pointer_mut(parent).unwrap().as_object_mut().unwrap().remove(key).unwrap();
+        let error = read(folder.path(), &without).unwrap_err();
+        assert!(error.contains(&format!("missing field `{key}`")), "{field}: {error}");
+        let mut with_more = valid_file();
+        with_more.pointer_mut(parent).unwrap()["color"] = 1.into();
+        let error = read(folder.path(), &with_more).unwrap_err();
+        assert!(error.contains("unknown field `color`"), "beside {field}: {error}");
+    }
+    let mut both = valid_file();
+    both["edits"][0]["cells"] = both["edits"][1]["cells"].clone();
+    assert!(read(folder.path(), &both).is_err(), "two kinds in one edit");
+}
+
+#[test]
+fn boxes_that_cannot_be_stored_are_not_added() {
+    let mut edits = Edits::default();
+    for (min_m, max_m) in [([-1e300; 3], [1e300; 3]), ([0.0; 3], [0.0; 3]), ([f64::NAN; 3], [1.0; 3])] {
+        let error = edits.push(Edit::Box(Aabb { min_m, max_m, ..rotated_box() })).unwrap_err().to_string();
+        assert!(error.starts_with("invalid edit: an erased box "), "{error}");
+    }
+    assert!(edits.is_empty());
+}
+
+/// Erased parts would return unnoticed if the edits were taken as absent.
+#[test]
+fn only_an_absent_file_means_no_edits() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    std::fs::write(at("scene.ply"), "ply").unwrap();
+    assert!(Edits::read(&at("scene.ply")).unwrap().is_empty(), "a single file has no edits");
+    assert!(Edits::read(&at("gone")).unwrap().is_empty());
+    std::fs::write(at("edits.json"), format!("\u{FEFF}{}", valid_file())).unwrap();
+    assert_eq!(Edits::read(folder.path()).unwrap().len(), 2, "with a byte order mark");
+    std::fs::remove_file(at("edits.json")).unwrap();
+    std::os::unix::fs::symlink(at("gone"), at("edits.json")).unwrap();
+    assert!(Edits::read(folder.path()).unwrap_err().to_string().contains("edits.json"), "a broken link");
+    std::fs::remove_file(at("edits.json")).unwrap();
+    std::fs::create_dir(at("edits.json")).unwrap();
+    assert!(Edits::read(folder.path()).unwrap_err().to_string().contains("edits.json"), "a folder");
 }

@@ -34,8 +34,8 @@ impl Lpips {
     /// Reads the weights: a safetensors file with `features.*` of `SqueezeNet` 1.1 and `lin0..6.weight`.
     pub fn load(path: &Path) -> Result<Self, Error> {
         let bytes =
-            files::read(path, files::NO_LIMIT).map_err(|source| Error::Read { path: path.to_owned(), source })?;
-        Self::from_bytes(&bytes).map_err(|source| Error::LpipsWeights { path: path.to_owned(), source })
+            files::read(path, files::Budget::PLAIN).map_err(|source| Error::Read { path: path.to_owned(), source })?;
+        Self::from_bytes(&bytes).map_err(|source| Error::LpipsWeights { path: path.to_owned(), source: source.into() })
     }
 
     fn from_bytes(bytes: &[u8]) -> candle_core::Result<Self> {
@@ -58,7 +58,7 @@ impl Lpips {
         if !(0..pair.truth_rgba.len() / 4).any(|ix| pair.is_visible(ix)) {
             return Err(Error::AllPixelsMasked);
         }
-        self.distance_in_network(pair).map_err(Error::LpipsNetwork)
+        self.distance_in_network(pair).map_err(|source| Error::LpipsNetwork(source.into()))
     }
 
     fn distance_in_network(&self, pair: &PixelPair<'_>) -> candle_core::Result<f64> {

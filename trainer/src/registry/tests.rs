@@ -11,7 +11,8 @@ fn names_files_and_extensions_are_unique() {
     assert!(is_unique(ModelKind::ALL.iter().map(|kind| kind.name()).collect()));
     assert!(is_unique(ModelKind::model_files().collect()));
     let single_files = ModelKind::ALL.iter().filter_map(|kind| kind.entry().single_file);
-    assert!(is_unique(single_files.flat_map(|single| single.extensions).copied().collect()));
+    let extensions = single_files.flat_map(|single| [single.extensions, single.unsupported_extensions]);
+    assert!(is_unique(extensions.flatten().copied().collect()));
     for kind in ModelKind::ALL {
         assert!(!kind.entry().files.is_empty(), "{kind:?}: a folder cannot be recognized");
         assert_eq!(ModelKind::from_name(kind.name()), Some(*kind));
@@ -105,5 +106,7 @@ fn checkpoint_of_an_unknown_method_is_rejected() {
 #[test]
 fn method_of_a_file_follows_from_its_extension() {
     let of = |name: &str| ModelKind::of_single_file(Path::new(name)).map(ModelKind::name);
-    assert_eq!([of("a.PLY"), of("a/b.spz"), of("a.glb"), of("ply")], [Some("splat"), Some("splat"), None, None]);
+    assert_eq!([of("a.PLY"), of("a/b.spz"), of("c.splat")], [Some("splat"); 3]);
+    assert_eq!(of("a.sog"), Some("splat"), "recognized, although not supported");
+    assert_eq!([of("a.glb"), of("ply")], [None; 2]);
 }

@@ -9,6 +9,12 @@ use std::path::Path;
 const MAX_COEFFICIENTS: usize = 16;
 /// Splats that are more transparent are not drawn, see shared/projection.wgsl.
 const MIN_ALPHA: f64 = 1.0 / 255.0;
+/// Maximum absolute coordinate of a mean in a file: beyond the size of the Earth, also in millimeters.
+const MAX_MEAN: f32 = 1e11;
+/// Logarithm of the maximum standard deviation in a file, 1000 km: larger splats cover every picture.
+const MAX_LOG_SCALE: f32 = 13.8;
+/// Maximum absolute color coefficient in a file. The sum of 16 larger ones might not be finite.
+const MAX_COLOR: f32 = 1e6;
 
 /// A cloud of splats in the world frame: raw optimized values, one entry per splat.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -64,8 +70,8 @@ impl SplatArrays {
         }
     }
 
-    /// Like [`Self::checked`], but leaves out splats with invalid numbers and names the first of them in a warning. An
-    /// infinite opacity is limited.
+    /// Like [`Self::checked`], but leaves out splats with invalid or absurd numbers and names the first of them in a
+    /// warning. An infinite opacity is limited.
     ///
     /// # Errors
     /// If the lengths of the arrays do not match, or there are splats but none is valid.
@@ -75,24 +81,37 @@ impl SplatArrays {
         for logit in self.opacity_logits.iter_mut().filter(|logit| logit.is_infinite()) {
             *logit = MAX_LOGIT.copysign(*logit);
         }
-        let n_coeffs = self.n_coefficients();
-        let is_valid = |ix: usize| {
-            let shape = self.means[ix].iter().chain(&self.log_scales[ix]).chain(&self.rotations_wxyz[ix]);
-            let color = self.sh[ix * n_coeffs..(ix + 1) * n_coeffs].as_flattened();
-            let mut all = shape.chain(color).chain([&self.opacity_logits[ix]]);
-            all.all(|value| value.is_finite()) && self.rotations_wxyz[ix].iter().any(|part| *part != 0.0)
-        };
-        let n_invalid = (0..self.n_splats()).filter(|ix| !is_valid(*ix)).count();
-        if n_invalid == 0 || n_invalid == self.n_splats() {
-            return self.checked();
+        let n_splats = self.n_splats();
+        let mut invalid = (0..n_splats).filter_map(|ix| Some((ix, self.fault(ix)?)));
+        let Some((first, fault)) = invalid.next() else { return self.checked() };
+        let n_invalid = 1 + invalid.count();
+        if n_invalid == n_splats {
+            self.checked()?;
+            return Err(Error::SplatArrays(format!("none of {n_splats} can be used; splat {first}: {fault}")));
         }
-        let first = (0..self.n_splats()).find(|ix| !is_valid(*ix)).unwrap_or_default();
         log::warn!(
-            "{}: left out {n_invalid} of {} splats with a non-finite number or a zero rotation; the first has index {first}",
-            path.display(),
-            self.n_splats()
+            "{}: left out {n_invalid} of {n_splats} splats with invalid numbers; the first has index {first}: {fault}",
+            path.display()
         );
-        self.filtered(is_valid).checked()
+        self.filtered(|ix| self.fault(ix).is_none()).checked()
+    }
+
+    /// Why a splat of a file cannot be drawn sensibly; `None` if it can.
+    fn fault(&self, ix: usize) -> Option<&'static str> {
+        let n_coeffs = self.n_coefficients();
+        let (mean, log_scales, rotation) = (&self.means[ix], &self.log_scales[ix], &self.rotations_wxyz[ix]);
+        let color = self.sh[ix * n_coeffs..(ix + 1) * n_coeffs].as_flattened();
+        let mut all = mean.iter().chain(log_scales).chain(rotation).chain(color).chain([&self.opacity_logits[ix]]);
+        let squared_length: f32 = rotation.iter().map(|part| part * part).sum();
+        // Each condition describes valid numbers, so that it is false for NaN.
+        let checks = [
+            (all.all(|value| value.is_finite()), "a number is not finite"),
+            (mean.iter().all(|meters| meters.abs() <= MAX_MEAN), "the mean is more than 1e11 m from the origin"),
+            (log_scales.iter().all(|log_scale| *log_scale <= MAX_LOG_SCALE), "a standard deviation exceeds 1e6 m"),
+            (squared_length.is_normal(), "the length of the rotation is zero, or its square exceeds the range of f32"),
+            (color.iter().all(|coefficient| coefficient.abs() <= MAX_COLOR), "a color coefficient exceeds 1e6"),
+        ];
+        checks.into_iter().find(|(is_valid, _)| !is_valid).map(|(_, fault)| fault)
     }
 
     /// Number of splats.
@@ -214,5 +233,45 @@ mod tests {
         assert_eq!(error_after(|s| s.means[1][2] = f32::NAN), "splats: mean of splat 1 is not finite");
         assert_eq!(error_after(|s| s.sh[4][0] = f32::INFINITY), "splats: color of splat 1 is not finite");
         assert_eq!(error_after(|s| s.rotations_wxyz[0] = [0.0; 4]), "splats: rotation of splat 0 has length zero");
+    }
+
+    type Change<'a> = &'a dyn Fn(&mut SplatArrays);
+
+    #[test]
+    fn splats_with_absurd_numbers_are_left_out() {
+        let valid_after = |change: &dyn Fn(&mut SplatArrays)| {
+            let mut splats = two_splats();
+            change(&mut splats);
+            splats.without_invalid(Path::new("test.ply"))
+        };
+        let limits = |s: &mut SplatArrays| {
+            s.means[0][1] = -MAX_MEAN;
+            s.log_scales[0] = [MAX_LOG_SCALE, -200.0, 0.0];
+            s.rotations_wxyz[0] = [0.0, 1e-15, 0.0, 1e15];
+            s.sh[1][2] = -MAX_COLOR;
+            s.opacity_logits[0] = 1e30;
+        };
+        assert_eq!(valid_after(&limits).unwrap().n_splats(), 2, "values at the limits are kept");
+        let faults: [(&str, Change<'_>); 8] = [
+            ("not finite", &|s| s.opacity_logits[0] = f32::NAN),
+            ("not finite", &|s| s.sh[3][0] = f32::NEG_INFINITY),
+            ("1e11 m", &|s| s.means[0][2] = 2e11),
+            ("1e6 m", &|s| s.log_scales[0][0] = 200.0),
+            ("rotation", &|s| s.rotations_wxyz[0] = [0.0; 4]),
+            ("rotation", &|s| s.rotations_wxyz[0] = [1e30; 4]),
+            ("rotation", &|s| s.rotations_wxyz[0] = [1e-30; 4]),
+            ("color", &|s| s.sh[0][1] = 2e6),
+        ];
+        for (what, change) in faults {
+            let splats = valid_after(change).unwrap();
+            assert_eq!((splats.n_splats(), splats.means[0]), (1, two_splats().means[1]), "{what}");
+            let mut splats = two_splats();
+            change(&mut splats);
+            assert!(splats.fault(0).is_some_and(|fault| fault.contains(what)) && splats.fault(1).is_none(), "{what}");
+        }
+        let error = valid_after(&|s| s.log_scales.fill([200.0; 3])).unwrap_err().to_string();
+        assert_eq!(error, "splats: none of 2 can be used; splat 0: a standard deviation exceeds 1e6 m");
+        let limited = valid_after(&|s| s.opacity_logits[0] = f32::INFINITY).unwrap();
+        assert_eq!(limited.opacity_logits[0], 30.0);
     }
 }

@@ -1,6 +1,6 @@
 //! Registers splats as a method.
 
-use super::file::{self, Format, IN_FOLDER};
+use super::file::{self, EXTENSIONS, Format, IN_FOLDER, UNSUPPORTED};
 use super::{SplatOptions, SplatTrainer};
 use crate::checkpoint::Checkpoint;
 use crate::edits::Edits;
@@ -21,7 +21,11 @@ pub(crate) static ENTRY: MethodEntry = MethodEntry {
     primitive: "splat",
     primitives_label: "Splats",
     files: &[IN_FOLDER],
-    single_file: Some(SingleFile { description: "a file of splats", extensions: &["ply", "spz"] }),
+    single_file: Some(SingleFile {
+        description: "a file of splats",
+        extensions: &EXTENSIONS,
+        unsupported_extensions: &UNSUPPORTED,
+    }),
     needs_depth: false,
     has_chunks: true,
     learnable: ParamSet::EXTRINSICS

@@ -4,6 +4,7 @@
 mod against_twin;
 #[cfg(test)]
 mod alignment_tests;
+mod antimatter15;
 pub mod arrays;
 mod arrival_gains;
 pub mod bench;
@@ -29,6 +30,7 @@ mod growth_search;
 #[cfg(test)]
 mod growth_search_tests;
 pub mod kernels;
+mod nearest;
 #[cfg(test)]
 mod non_finite_tests;
 mod options;

@@ -1,11 +1,14 @@
-//! Initial splats: flat discs at depth readings, or a random cloud in the cameras' common field of view.
+//! Initial splats: flat discs at depth readings, or balls at given points and a random cloud in the cameras' common field
+//! of view.
 #![expect(
     clippy::cast_possible_truncation,
     reason = "pixels, cells and random draws are rounded down on purpose, within ranges that are checked"
 )]
 
 use super::arrays::SplatArrays;
+use super::nearest::mean_spacings_m;
 use super::views::FAR_M;
+use crate::InitialPoints;
 use crate::gpu::{f32_of, f32s_of};
 use keyframe::Keyframe;
 use kinematics::random::Random;
@@ -24,6 +27,8 @@ const SEED_OPACITY: f64 = 0.7;
 /// Number of initial splats if there is no depth.
 const N_RANDOM: usize = 50_000;
 const RANDOM_OPACITY: f64 = 0.1;
+/// As in Kerbl et al. 2023.
+const POINT_OPACITY: f64 = 0.1;
 const SH_0: f64 = 0.282_094_791_773_878_14;
 
 /// Creates discs and stores the positions that already have splats.
@@ -280,6 +285,36 @@ impl InverseDepths {
     }
 }
 
+/// Creates balls at given points. Their standard deviation is the mean distance to the three nearest points (Kerbl et al.
+/// 2023, section 5.1). Of more than `n_max` points, those at regular intervals of the list are used. Points without a color
+/// get the color of the first keyframe that shows them.
+pub(crate) fn balls(points: &InitialPoints, keyframes: &[&Keyframe], n_max: usize) -> SplatArrays {
+    // Of several points at one position, the first is used: a distance of zero is no size.
+    let mut seen = HashSet::new();
+    let is_first = |ix: &usize| seen.insert(points.points_in_world_m[*ix].map(f32::to_bits));
+    let distinct: Vec<usize> = (0..points.points_in_world_m.len()).filter(is_first).collect();
+    let n = distinct.len().min(n_max);
+    let chosen: Vec<usize> = (0..n).map(|ix| distinct[ix * distinct.len() / n]).collect();
+    let positions: Vec<[f32; 3]> = chosen.iter().map(|ix| points.points_in_world_m[*ix]).collect();
+    let colors: Vec<[f64; 3]> = chosen.par_iter().map(|ix| color_of_point(points, *ix, keyframes)).collect();
+    let mut seeds = Seeds::new();
+    for ((position, color), spacing_m) in positions.iter().zip(colors).zip(mean_spacings_m(&positions)) {
+        let Some(spacing_m) = spacing_m else { continue };
+        let position = Point3::from(position.map(f64::from));
+        seeds.push(&position, &Vector3::z(), [spacing_m; 3], POINT_OPACITY, color);
+    }
+    seeds.arrays
+}
+
+fn color_of_point(points: &InitialPoints, ix: usize, keyframes: &[&Keyframe]) -> [f64; 3] {
+    const GRAY: [f64; 3] = [0.5; 3];
+    if let Some(color) = points.colors_srgb.get(ix) {
+        return color.map(|channel| f64::from(channel) / 255.0);
+    }
+    let position = Point3::from(points.points_in_world_m[ix].map(f64::from));
+    keyframes.iter().find_map(|keyframe| color_at(keyframe, &position)).unwrap_or(GRAY)
+}
+
 /// Creates a random cloud along the rays of all keyframes, densest around their common focus.
 pub(crate) fn random_cloud(keyframes: &[&Keyframe], seed: u64, n_max: usize) -> SplatArrays {
     let mut seeds = Seeds::new();
@@ -397,6 +432,41 @@ mod tests {
             base: None,
             split: keyframe::Split::Train,
             truth: None,
+        }
+    }
+
+    #[test]
+    fn balls_have_the_positions_and_colors_of_their_points() {
+        let points = InitialPoints {
+            points_in_world_m: vec![[0.0; 3], [3.0, 0.0, 0.0], [0.0, 4.0, 0.0], [3.0, 4.0, 0.0], [0.0; 3]],
+            colors_srgb: vec![[255, 0, 51], [0; 3], [1; 3], [2; 3], [3; 3]],
+        };
+        let seeds = balls(&points, &[], 10);
+        assert_eq!(seeds.means, points.points_in_world_m[..4], "a repeated position is used once");
+        let color = seeds.sh[0].map(|coefficient| SH_0 * f64::from(coefficient) + 0.5);
+        assert!((0..3).all(|ix| (color[ix] - [1.0, 0.0, 0.2][ix]).abs() < 1e-6), "{color:?}");
+        let size_m = (3.0 + 4.0 + 5.0) / 3.0;
+        assert!(seeds.log_scales.as_flattened().iter().all(|log_scale| (log_scale.exp() - size_m).abs() < 1e-5));
+        assert!((0..4).all(|ix| (seeds.opacity(ix) - POINT_OPACITY).abs() < 1e-6));
+        assert_eq!(balls(&points, &[], 2).means, [[0.0; 3], [0.0, 4.0, 0.0]], "every second one");
+        assert_eq!(balls(&points, &[], 1).n_splats(), 0, "a single point has no size");
+        assert_eq!(balls(&InitialPoints::default(), &[], 10).n_splats(), 0);
+        seeds.checked().unwrap();
+    }
+
+    #[test]
+    fn points_without_colors_get_those_of_keyframes() {
+        let mut keyframe = wall_keyframe([100, 80], false);
+        let half_red = |ix: usize| if ix % 100 < 50 { [255, 0, 0, 255] } else { [0, 0, 255, 255] };
+        keyframe.rgba_srgb = (0..8000).flat_map(half_red).collect();
+        let points = InitialPoints {
+            points_in_world_m: vec![[-0.5, 0.0, 2.0], [0.5, 0.0, 2.0], [0.0, 0.0, -2.0]],
+            colors_srgb: Vec::new(),
+        };
+        let seeds = balls(&points, &[&keyframe], 10);
+        for (ix, expected) in [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.5; 3]].into_iter().enumerate() {
+            let color = seeds.sh[ix].map(|coefficient| SH_0 * f64::from(coefficient) + 0.5);
+            assert!((0..3).all(|channel| (color[channel] - expected[channel]).abs() < 1e-6), "{ix}: {color:?}");
         }
     }
 

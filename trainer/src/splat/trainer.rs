@@ -42,7 +42,10 @@ use crate::model_chunks::PendingChunks;
 use crate::model_metadata::{METADATA_FILE, read_metadata};
 use crate::model_options::{MethodOptions, ModelOptions};
 use crate::packing::{Format, Output};
-use crate::{Bounds, Error, Method, Packing, Picture, Progress, Projection, QueuedPicture, RenderRequest, Rendered};
+use crate::{
+    Bounds, Error, InitialPoints, Method, Packing, Picture, Progress, Projection, QueuedPicture, RenderRequest,
+    Rendered,
+};
 use calibration::{Alignment, CalibratedCamera, CameraCorrection, Trial, TrialReport};
 use keyframe::{Keyframe, Split};
 use kinematics::Stamp;
@@ -187,7 +190,8 @@ impl SplatTrainer {
         }
     }
 
-    /// Seeds the areas that depth does not cover. Uses discs if any keyframe has depth, and a random cloud otherwise.
+    /// Seeds the areas that depth does not cover. Uses discs if any keyframe has depth; otherwise balls at the initial
+    /// points, if there are any, and a random cloud.
     fn prepare_training(&mut self) -> Result<(), Error> {
         self.seed_from_depth()?;
         for keyframe in self.seeding.take_unseeded() {
@@ -200,8 +204,14 @@ impl SplatTrainer {
         }
         if self.model.splats.n_splats == 0 && !self.views.is_empty() {
             let keyframes: Vec<&Keyframe> = self.views.keyframes().map(AsRef::as_ref).collect();
-            let cloud = seed::random_cloud(&keyframes, self.options.common.seed, self.options.cap() as usize);
-            self.add(&cloud)?;
+            let n_max = self.options.cap() as usize;
+            let points = self.seeding.points.as_deref();
+            let balls = points.map(|points| seed::balls(points, &keyframes, n_max)).unwrap_or_default();
+            let cloud = seed::random_cloud(&keyframes, self.options.common.seed, n_max);
+            // Points are missing where images have no texture, so there are at least as many splats as without points.
+            let n_random = cloud.n_splats().saturating_sub(balls.n_splats());
+            self.add(&balls)?;
+            self.add(&cloud.filtered(|ix| ix < n_random))?;
         }
         Ok(())
     }
@@ -269,6 +279,11 @@ impl Method for SplatTrainer {
         self.update_growth_search();
         self.recorder.passes.clear_bindings();
         Ok(())
+    }
+
+    fn set_initial_points(&mut self, points: &Arc<InitialPoints>) -> bool {
+        self.seeding.points = Some(points.clone());
+        true
     }
 
     fn step(&mut self, n: u64) -> Result<u64, Error> {
@@ -455,6 +470,11 @@ fn displayed<'a>(search: &'a GrowthSearch, trials: &'a SplatTrials, model: &'a T
 impl SplatTrainer {
     pub(super) fn assume_step_millis(&mut self, millis: f64) {
         self.optimizer.submits.assume_step_millis(millis);
+    }
+
+    /// Creates the splats with which training starts.
+    pub(super) fn prepare_for_test(&mut self) {
+        self.prepare_training().unwrap();
     }
 
     /// Limits the GPU memory for images, as on a software adapter.

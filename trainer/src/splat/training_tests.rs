@@ -8,7 +8,7 @@ use crate::gpu::testing::test_gpu;
 use crate::gpu::{Gpu, f32s_of};
 use crate::model_options::{CommonOptions, ModelOptions};
 use crate::view::Camera;
-use crate::{Aabb, Method, Packing, Projection, RenderRequest, Rendered};
+use crate::{Aabb, InitialPoints, Method, Packing, Projection, RenderRequest, Rendered};
 use calibration::{CameraRefinement, ParamSet};
 use keyframe::{DepthMap, Keyframe, Split};
 use kinematics::{Stamp, Transform};
@@ -257,6 +257,46 @@ fn trains_without_depth_from_random_points() {
     train(&mut trainer, 120);
     let after = test_psnr(&mut trainer, &keyframes);
     assert!(after > before + 2.0, "{before} -> {after} dB");
+}
+
+#[test]
+fn training_without_depth_starts_from_initial_points() {
+    let gpu = test_gpu();
+    let truth = scene();
+    let points = Arc::new(InitialPoints { points_in_world_m: truth.means, colors_srgb: Vec::new() });
+    let started = |keyframes: &[Arc<Keyframe>], points: Option<&Arc<InitialPoints>>, max_splats: u32| {
+        let mut trainer =
+            SplatTrainer::new(gpu.clone(), options().with(|options| options.specific.max_splats = max_splats)).unwrap();
+        keyframes.iter().for_each(|keyframe| trainer.push(keyframe.clone()).unwrap());
+        if let Some(points) = points {
+            assert!(trainer.set_initial_points(points));
+        }
+        trainer.prepare_for_test();
+        trainer
+    };
+    let [without_depth, with_depth] = [false, true].map(|with_depth| keyframes(&gpu, with_depth));
+    let n_points = points.points_in_world_m.len();
+    let mut trainer = started(&without_depth, Some(&points), 1000);
+    let seeds = trainer.arrays().unwrap();
+    assert_eq!((&seeds.means[..n_points], seeds.n_splats()), (&points.points_in_world_m[..], 1000));
+    let random = started(&without_depth, None, 1000).arrays().unwrap();
+    assert_eq!(seeds.means[n_points..], random.means[..1000 - n_points], "the rest is random");
+    let few = started(&without_depth, Some(&points), 100).arrays().unwrap();
+    let regular: Vec<[f32; 3]> = points.points_in_world_m.iter().step_by(4).copied().collect();
+    assert_eq!(few.means, regular, "at most the limit");
+    let with_points = started(&with_depth, Some(&points), 1000).arrays().unwrap();
+    assert!(with_points == started(&with_depth, None, 1000).arrays().unwrap(), "depth has priority");
+
+    // The same points give the same model, and a resumed run uses them, too.
+    train(&mut trainer, 40);
+    let mut again = started(&without_depth, Some(&points), 1000);
+    train(&mut again, 20);
+    let checkpoint = again.checkpoint().unwrap().finish().unwrap();
+    let (mut resumed, untrained) = SplatTrainer::resume(gpu.clone(), &checkpoint, &without_depth).unwrap();
+    untrained.into_iter().for_each(|keyframe| resumed.push(keyframe).unwrap());
+    resumed.set_initial_points(&points);
+    train(&mut resumed, 20);
+    assert!(resumed.arrays().unwrap() == trainer.arrays().unwrap());
 }
 
 /// The depth covers a band of coarse cells, as from a range scanner.

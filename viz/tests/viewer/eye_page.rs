@@ -284,10 +284,10 @@ fn the_eye_stays_in_front_of_walls() {
     }
     page.rest();
     let eyes = page.renderer.eyes_since(n_before);
-    let travelled: f64 = eyes.windows(2).map(|pair| (pair[1] - pair[0]).norm()).sum();
+    let traveled: f64 = eyes.windows(2).map(|pair| (pair[1] - pair[0]).norm()).sum();
     let closest = eyes.iter().map(|eye| clearance(*eye)).fold(f64::INFINITY, f64::min);
-    eprintln!("{} pictures on a way of {travelled:.1} m, at least {closest:.3} m from the walls", eyes.len());
-    assert!(travelled > 5.0, "the eye moved only {travelled} m");
+    eprintln!("{} pictures on a way of {traveled:.1} m, at least {closest:.3} m from the walls", eyes.len());
+    assert!(traveled > 5.0, "the eye moved only {traveled} m");
     assert!(closest > NEAR_M, "an eye was {closest} m from a wall");
     page.close();
 }

@@ -13,6 +13,7 @@ export function keepToken(): boolean {
   const token = new URLSearchParams(location.hash.slice(1)).get("token");
   if (token === null || location.protocol !== "https:") return false;
   const name = `__Host-fieldrig-${location.port || "443"}`;
+  // biome-ignore lint/suspicious/noDocumentCookie: not all browsers that can show this page have the Cookie Store API.
   document.cookie = `${name}=${encodeURIComponent(token)}; Path=/; Secure; SameSite=Strict`;
   history.replaceState(null, "", location.pathname + location.search);
   return true;

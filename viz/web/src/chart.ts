@@ -122,7 +122,10 @@ function finite(curve: Curve): Curve {
 
 function line(context: CanvasRenderingContext2D, points: readonly (readonly [number, number])[]): void {
   context.beginPath();
-  points.forEach(([px, py], ix) => (ix === 0 ? context.moveTo(px, py) : context.lineTo(px, py)));
+  points.forEach(([px, py], ix) => {
+    if (ix === 0) context.moveTo(px, py);
+    else context.lineTo(px, py);
+  });
   context.stroke();
 }
 
@@ -153,8 +156,9 @@ function timeTicks(max: number, n: number): number[] {
 /** Duration as readable text. */
 export function timeText(seconds: number): string {
   if (seconds < 120) return `${Number(seconds.toFixed(seconds < 10 ? 1 : 0))} s`;
-  const minutes = Math.floor(seconds / 60);
-  const rest = Math.round(seconds - 60 * minutes);
+  const whole = Math.round(seconds);
+  const minutes = Math.floor(whole / 60);
+  const rest = whole - 60 * minutes;
   if (minutes < 60) return rest ? `${minutes} min ${rest} s` : `${minutes} min`;
   return `${Math.floor(minutes / 60)} h ${minutes % 60} min`;
 }

@@ -85,7 +85,7 @@ export class LocalModel {
     this.worldFromModel.copy(worldFromCamera(header.world_from_model));
     this.meshes.root.matrix.copy(this.worldFromModel);
     this.meshes.root.matrixWorldNeedsUpdate = true;
-    this.then(async (isCurrent) => {
+    this.enqueue(async (isCurrent) => {
       if (header.kind === "mesh") await this.meshes.set(header, payload, isCurrent);
       else this.splats.set(header, payload);
     });
@@ -93,7 +93,7 @@ export class LocalModel {
 
   removed({ method, ids }: ModelChunksRemoved): void {
     if (method !== this.drawn) return;
-    this.then(async () => {
+    this.enqueue(async () => {
       for (const id of ids) {
         this.meshes.remove(id);
         this.splats.remove(id);
@@ -118,7 +118,8 @@ export class LocalModel {
     this.splats.setView(worldFromCamera(view.world_from_camera), this.worldFromModel, sizePx, focalPx, depthRange);
   }
 
-  private then(act: (isCurrent: () => boolean) => Promise<void>): void {
+  /** Decodes and changes chunks one after the other. */
+  private enqueue(act: (isCurrent: () => boolean) => Promise<void>): void {
     const { generation } = this;
     const isCurrent = (): boolean => generation === this.generation;
     this.decoding = this.decoding

@@ -49,7 +49,9 @@ export class SplatSorter {
       this.positions[3 * slot + 1] = minM[1] + ((low >>> 13) & 8191) * step[1]!;
       this.positions[3 * slot + 2] = minM[2] + ((low >>> 26) | ((high & 127) << 6)) * step[2]!;
     }
-    units.forEach((unit, ix) => (this.counts[unit] = Math.min(UNIT_SPLATS, n - ix * UNIT_SPLATS)));
+    units.forEach((unit, ix) => {
+      this.counts[unit] = Math.min(UNIT_SPLATS, n - ix * UNIT_SPLATS);
+    });
   }
 
   free({ units }: FreeUnits): void {

@@ -236,7 +236,12 @@ impl Args {
                 let why = "--with-joints: with samples in JSON, --urdf and --tip are needed, too";
                 return Err(BadArgument(why.to_owned()).into());
             }
-            (_, None) => Source::File(SamplesFile::read(&self.input)?),
+            (_, None) => {
+                let file = SamplesFile::read(&self.input)?;
+                let unused = file.unused(self.with_joints);
+                unused.iter().for_each(|note| log::info!("{}: {note}", self.input.display()));
+                Source::File(file)
+            }
         };
         Ok((source, arm))
     }

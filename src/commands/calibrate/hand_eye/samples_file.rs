@@ -1,7 +1,7 @@
 //! The samples file of `fieldrig calibrate hand-eye`, and the target in its images.
 
 use super::super::images::{self, DetectedImage, ImageFile, OtherSize};
-use super::super::json_object::JsonObject;
+use super::super::json_object::{self, JsonObject};
 use super::super::lens::LensFile;
 use super::super::{outputs, target_argument};
 use crate::exit::{BadArgument, InsufficientData};
@@ -9,8 +9,8 @@ use calibration::hand_eye::{BoardObservation, HandEyeSample, Setup};
 use capture::camera_info;
 use kinematics::{Intrinsics, Transform};
 use nalgebra::DMatrix;
-use serde_json::Value;
 use session::calibration_report::{Photos, Unused};
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use targets::TargetSpec;
 
@@ -56,10 +56,20 @@ impl SamplesFile {
     pub(super) fn read(path: &Path) -> Result<Self, BadArgument> {
         let name = path.display().to_string();
         let text = outputs::read_text(path)?;
-        let mut value: Value = serde_json::from_str(&text)
+        let mut value = json_object::parse(&text)
             .map_err(|error| BadArgument(format!("{name}: {error}{}", not_json_hint(&text))))?;
+        let folder = path.parent().unwrap_or(Path::new(""));
         if let Some(intrinsics) = value.get_mut("intrinsics") {
-            camera_info::convert(intrinsics).map_err(|error| BadArgument(format!("{name}: intrinsics: {error}")))?;
+            let invalid = |why: String| BadArgument(format!("{name}: intrinsics: {why}"));
+            let mut source = String::new();
+            if let Some(file) = intrinsics.as_str() {
+                let file = folder.join(file);
+                source = format!("{}: ", file.display());
+                let text = outputs::read_text(&file)?;
+                *intrinsics = camera_info::parse_value(&text).map_err(|why| invalid(format!("{source}{why}")))?;
+            }
+            let notes = camera_info::convert(intrinsics).map_err(|why| invalid(format!("{source}{why}")))?;
+            notes.iter().for_each(|note| log::warn!("{name}: intrinsics: {source}{note}"));
         }
         let file = JsonObject::new(&name, String::new(), &value, &FILE_KEYS)?;
         let intrinsics = file.object("intrinsics", &LensFile::KEYS)?;
@@ -71,17 +81,18 @@ impl SamplesFile {
                 return Err(file.invalid("setup", format!("{other:?}, expected \"eye-in-hand\" or \"eye-to-hand\"")));
             }
         };
-        let folder = path.parent().unwrap_or(Path::new(""));
         let samples = file.objects("samples", &SAMPLE_KEYS)?;
         if samples.is_empty() {
             return Err(file.invalid("samples", "the list is empty; add 12 or more robot poses with their images"));
         }
+        let entries: Vec<Entry> = samples.iter().map(|sample| Entry::read(sample, folder)).collect::<Result<_, _>>()?;
+        check_images(&samples, &entries)?;
         let read = Self {
             path: path.to_owned(),
             intrinsics: intrinsics.map(|lens| LensFile::read(&lens)).transpose()?,
             target: target.map_err(|why| file.invalid("target", why))?,
             setup,
-            entries: samples.iter().map(|sample| Entry::read(sample, folder)).collect::<Result<_, _>>()?,
+            entries,
         };
         if read.has_images() && read.target.is_none() {
             return Err(file.invalid(
@@ -111,6 +122,19 @@ impl SamplesFile {
             Some(lens) => lens.covariance(intrinsics).map_err(of_file)?,
             None => None,
         })
+    }
+
+    /// Parts of the file that have no effect on the result: a clause without a period each.
+    ///
+    /// * `estimates_joints`: whether the offsets of joints are estimated.
+    pub(super) fn unused(&self, estimates_joints: bool) -> Vec<&'static str> {
+        let without_images = self.intrinsics.is_some() && !self.has_images();
+        let without_flag = !estimates_joints && self.entries.iter().any(|entry| entry.joints.is_some());
+        let notes = [
+            (without_images, "intrinsics are not used, because no sample has an image"),
+            (without_flag, "joints are only used with --with-joints"),
+        ];
+        notes.into_iter().filter(|(applies, _)| *applies).map(|(_, note)| note).collect()
     }
 
     fn has_images(&self) -> bool {
@@ -194,10 +218,38 @@ impl Samples {
     }
 }
 
+/// Rejects an image with two robot poses. Identical samples are allowed.
+fn check_images(samples: &[JsonObject<'_>], entries: &[Entry]) -> Result<(), BadArgument> {
+    let mut first_use: BTreeMap<&Path, usize> = BTreeMap::new();
+    for (ix, entry) in entries.iter().enumerate() {
+        let EntryBoard::Image(image) = &entry.board else { continue };
+        let first = *first_use.entry(&image.path).or_insert(ix);
+        if entries[first].base_from_flange != entry.base_from_flange {
+            let why = format!("{} is the image of samples[{first}], too, which has another robot pose", image.name);
+            return Err(samples[ix].invalid("image", why));
+        }
+    }
+    Ok(())
+}
+
+/// A pose in a sample.
+fn pose(sample: &JsonObject<'_>, key: &str) -> Result<Option<Transform>, BadArgument> {
+    /// Positions beyond this are assumed to be mistakes.
+    const MAX_POSITION_M: f64 = 1e4;
+    let pose = sample.transform(key)?;
+    let farthest_m = pose.map_or(0.0, |pose| pose.translation.vector.amax());
+    if farthest_m > MAX_POSITION_M {
+        let why =
+            format!("its position is {farthest_m:e} m away, at most {MAX_POSITION_M:e} m are accepted; write meters");
+        return Err(sample.invalid(key, why));
+    }
+    Ok(pose)
+}
+
 impl Entry {
     fn read(sample: &JsonObject<'_>, folder: &Path) -> Result<Self, BadArgument> {
-        let base_from_flange = sample.required("base_from_flange", sample.transform("base_from_flange")?)?;
-        let board = match (sample.transform("camera_from_board")?, sample.text("image")?) {
+        let base_from_flange = sample.required("base_from_flange", pose(sample, "base_from_flange")?)?;
+        let board = match (pose(sample, "camera_from_board")?, sample.text("image")?) {
             (Some(pose), None) => EntryBoard::Pose(pose),
             (None, Some(image)) => {
                 let path = folder.join(image);
@@ -215,3 +267,6 @@ impl Entry {
         Ok(Self { base_from_flange, board, joints: sample.numbers("joints")? })
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -18,9 +18,10 @@ struct Element<'a> {
     name: String,
     count: usize,
     row_bytes: usize,
+    /// The properties that are not lists.
     properties: Vec<Property>,
-    /// Types of length and numbers of the list property, which must be the last; `None` without one.
-    list: Option<[NumberType; 2]>,
+    /// The list properties, such as the corners of a face. They are skipped.
+    lists: Vec<List>,
     /// The rows, little-endian; an error if they are not in the file.
     rows: Result<Cow<'a, [u8]>, String>,
 }
@@ -29,6 +30,15 @@ struct Property {
     name: String,
     number_type: NumberType,
     offset: usize,
+}
+
+/// A list property: a length, followed by as many numbers.
+struct List {
+    length: NumberType,
+    number: NumberType,
+    /// Number of the properties before it that are not lists, and their size.
+    n_before: usize,
+    bytes_before: usize,
 }
 
 /// How numbers are stored.
@@ -148,7 +158,7 @@ impl<'a> Header<'a> {
     pub(super) fn table(&self, name: &str) -> Result<Table<'_>, String> {
         let element = self.elements.iter().find(|element| element.name == name);
         let element = element.ok_or_else(|| format!("element {name:?} is missing"))?;
-        if element.list.is_some() {
+        if !element.lists.is_empty() {
             return Err(format!("element {name:?} has a list, expected numbers"));
         }
         Ok(Table { element, rows: element.rows.as_ref().map_err(Clone::clone)? })
@@ -170,23 +180,20 @@ impl<'a> Header<'a> {
             (["element", name, count], _) => {
                 let count = count.parse().map_err(|_| format!("element {name}: count {count:?} is not a number"))?;
                 let (name, rows) = ((*name).to_owned(), Err("it is not in the file".to_owned()));
-                self.elements.push(Element { name, count, row_bytes: 0, properties: Vec::new(), list: None, rows });
+                let (properties, lists) = (Vec::new(), Vec::new());
+                self.elements.push(Element { name, count, row_bytes: 0, properties, lists, rows });
             }
             (["property", "list", length, word, name], Some(element)) => {
                 let types = [length, word].map(|word| NumberType::of(word));
                 let [Some(length), Some(number)] = types else {
                     return Err(format!("property {name}: unknown type in {line:?}"));
                 };
-                if element.list.replace([length, number]).is_some() {
-                    return Err(format!("element {}: more than one list", element.name));
-                }
+                let (n_before, bytes_before) = (element.properties.len(), element.row_bytes);
+                element.lists.push(List { length, number, n_before, bytes_before });
             }
             (["property", word, name], Some(element)) => {
                 let number_type =
                     NumberType::of(word).ok_or_else(|| format!("property {name}: unknown type {word:?}"))?;
-                if element.list.is_some() {
-                    return Err(format!("element {}: property {name:?} follows a list", element.name));
-                }
                 if element.properties.iter().any(|property| property.name == *name) {
                     return Err(format!("element {}: two properties {name:?}", element.name));
                 }
@@ -201,9 +208,9 @@ impl<'a> Header<'a> {
     /// Finds the rows of each element up to the first incomplete one; later ones keep their error.
     fn locate_binary(&mut self, mut rest: &'a [u8], format: Format) {
         for element in &mut self.elements {
-            let n_bytes = match element.list {
-                None => element.count.checked_mul(element.row_bytes),
-                Some(list) => lists_bytes(element, list, rest, format),
+            let n_bytes = match element.lists.is_empty() {
+                true => element.count.checked_mul(element.row_bytes),
+                false => bytes_with_lists(element, rest, format),
             };
             let Some((rows, after)) = n_bytes.and_then(|n_bytes| rest.split_at_checked(n_bytes)) else {
                 element.rows = Err(truncated(element));
@@ -211,7 +218,7 @@ impl<'a> Header<'a> {
             };
             rest = after;
             element.rows = Ok(match format {
-                Format::BigEndian if element.list.is_none() => swapped(element, rows).into(),
+                Format::BigEndian if element.lists.is_empty() => swapped(element, rows).into(),
                 _ => rows.into(),
             });
         }
@@ -223,7 +230,7 @@ impl<'a> Header<'a> {
         let mut lines = text.split(|byte| *byte == b'\n').filter(|line| !line.trim_ascii().is_empty());
         for element in &mut self.elements {
             // A number and a space take at least two bytes.
-            let n_words = element.count.checked_mul(element.properties.len() + usize::from(element.list.is_some()));
+            let n_words = element.count.checked_mul(element.properties.len() + element.lists.len());
             if n_words.is_none_or(|n_words| n_words > text.len().div_ceil(2)) {
                 element.rows = Err(truncated(element));
                 return;
@@ -233,9 +240,11 @@ impl<'a> Header<'a> {
                 let mut words = std::str::from_utf8(lines.next()?).ok()?.split_ascii_whitespace();
                 let n_expected = element.properties.len();
                 let wrong = || Some(Err(format!("it does not have {n_expected} numbers")));
-                let mut next = || words.next();
-                for property in &element.properties {
-                    let Some(word) = next() else { return wrong() };
+                for (property_ix, property) in element.properties.iter().enumerate() {
+                    if skip_lists(&element.lists, property_ix, &mut words).is_none() {
+                        return wrong();
+                    }
+                    let Some(word) = words.next() else { return wrong() };
                     let Some(bytes) = property.number_type.little_endian(word) else {
                         let shown: String = word.chars().take(30).collect();
                         return Some(Err(format!(
@@ -245,13 +254,8 @@ impl<'a> Header<'a> {
                     };
                     rows.extend(bytes);
                 }
-                if element.list.is_some() {
-                    let Some(n) = next().and_then(|word| word.parse::<usize>().ok()) else { return wrong() };
-                    if (0..n).try_for_each(|_| next().map(drop)).is_none() {
-                        return wrong();
-                    }
-                }
-                if next().is_some() { wrong() } else { Some(Ok(())) }
+                let is_complete = skip_lists(&element.lists, n_expected, &mut words).is_some();
+                if is_complete && words.next().is_none() { Some(Ok(())) } else { wrong() }
             };
             let problem = (0..element.count).find_map(|row| match read_row() {
                 Some(Ok(())) => None,
@@ -272,21 +276,33 @@ fn truncated(element: &Element<'_>) -> String {
     format!("truncated: fewer than {} rows of {:?}", element.count, element.name)
 }
 
-/// Size of the rows of an element with a list; `None` if they are not complete.
-fn lists_bytes(
-    element: &Element<'_>,
-    [length, number]: [NumberType; 2],
-    bytes: &[u8],
-    format: Format,
-) -> Option<usize> {
+/// Skips the lists that follow the given number of other properties in a row of text; `None` if they are not complete.
+fn skip_lists<'a>(lists: &[List], n_before: usize, words: &mut impl Iterator<Item = &'a str>) -> Option<()> {
+    for _ in lists.iter().filter(|list| list.n_before == n_before) {
+        let length: usize = words.next()?.parse().ok()?;
+        for _ in 0..length {
+            words.next()?;
+        }
+    }
+    Some(())
+}
+
+/// Size of the rows of an element with lists; `None` if they are not complete.
+fn bytes_with_lists(element: &Element<'_>, bytes: &[u8], format: Format) -> Option<usize> {
     let mut at = 0_usize;
     for _ in 0..element.count {
-        at = at.checked_add(element.row_bytes)?;
-        let mut length_bytes = bytes.get(at..at.checked_add(length.bytes())?)?.to_vec();
-        if format == Format::BigEndian {
-            length_bytes.reverse();
+        let mut n_passed_bytes = 0;
+        for list in &element.lists {
+            at = at.checked_add(list.bytes_before - n_passed_bytes)?;
+            n_passed_bytes = list.bytes_before;
+            let mut length = bytes.get(at..at.checked_add(list.length.bytes())?)?.to_vec();
+            if format == Format::BigEndian {
+                length.reverse();
+            }
+            let n_number_bytes = list.length.length(&length)?.checked_mul(list.number.bytes())?;
+            at = at.checked_add(list.length.bytes())?.checked_add(n_number_bytes)?;
         }
-        at = at.checked_add(length.bytes())?.checked_add(length.length(&length_bytes)?.checked_mul(number.bytes())?)?;
+        at = at.checked_add(element.row_bytes - n_passed_bytes)?;
     }
     Some(at)
 }

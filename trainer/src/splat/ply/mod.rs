@@ -1,8 +1,11 @@
 //! Splats in `.ply` files: reads and writes the layout of Kerbl et al. 2023, and reads the packed layout of
-//! `SuperSplat`.
+//! `SuperSplat`. Reads point clouds, too.
 
 mod header;
 mod packed;
+mod points;
+
+pub use points::read_points;
 
 use crate::Error;
 use crate::splat::arrays::SplatArrays;
@@ -11,7 +14,7 @@ use std::io::{BufWriter, Write};
 use std::path::Path;
 
 /// Constant factor of the first spherical harmonic, `1 / (2 sqrt(pi))`.
-const SH_0: f32 = 0.282_094_8;
+pub(super) const SH_0: f32 = 0.282_094_8;
 /// Thickness of a flat splat (2D Gaussian splatting), relative to its smaller radius, as a logarithm.
 const LOG_FLATNESS: f32 = -7.0;
 /// Properties of splats that are not used: normals, which are zero in these files, and names of other programs for numbers
@@ -23,7 +26,8 @@ const UNUSED: [&str; 5] = ["nx", "ny", "nz", "label", "id"];
 ///
 /// Splats with invalid numbers are left out, and properties that are not used are named, both with a warning.
 pub fn read(path: &Path) -> Result<SplatArrays, Error> {
-    let bytes = files::read(path, files::NO_LIMIT).map_err(|source| Error::Read { path: path.to_owned(), source })?;
+    let bytes =
+        files::read(path, files::Budget::SPLATS).map_err(|source| Error::Read { path: path.to_owned(), source })?;
     let (splats, notes) = from_bytes(&bytes).map_err(|reason| Error::SplatFile { path: path.to_owned(), reason })?;
     for note in notes {
         log::warn!("{}: {note}", path.display());
@@ -45,8 +49,7 @@ pub fn write(path: &Path, splats: &SplatArrays) -> Result<(), Error> {
 fn from_bytes(bytes: &[u8]) -> Result<(SplatArrays, Vec<String>), String> {
     let header = Header::parse(bytes)?;
     let mut notes = Vec::new();
-    let is_mip = |comment: &String| comment.to_ascii_lowercase().replace(' ', "") == "splatrendermode:mip";
-    let is_antialiased = header.comments().iter().any(is_mip);
+    let is_antialiased = is_antialiased(header.comments());
     if header.n_unread() > 0 {
         notes.push(format!("{} bytes after the last row are not used", header.n_unread()));
     }
@@ -84,6 +87,17 @@ fn from_bytes(bytes: &[u8]) -> Result<(SplatArrays, Vec<String>), String> {
         rows.for_each(|row| widen(&mut splats, row, filter.f32(row)));
     }
     Ok((splats, notes))
+}
+
+/// Whether the comments name the opacity correction of Mip-Splatting, as Brush (`SplatRenderMode: mip`) and Postshot
+/// (`antialiased 1`) do. The last such comment counts.
+fn is_antialiased(comments: &[String]) -> bool {
+    let by_comment = |comment: &String| match comment.to_ascii_lowercase().replace(' ', "").as_str() {
+        "splatrendermode:mip" | "antialiased1" => Some(true),
+        "splatrendermode:default" | "splatrendermode:2dgs" | "antialiased0" => Some(false),
+        _ => None,
+    };
+    comments.iter().rev().find_map(by_comment).unwrap_or(false)
 }
 
 fn is_used(name: &str, color: &ColorColumns<'_>) -> bool {

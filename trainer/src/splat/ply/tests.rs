@@ -130,6 +130,12 @@ fn every_format_gives_the_same_splats() {
     let faces = [3, 0, 0, 0, 0, 1, 0, 0, 0, 2, 0, 0, 0, 1, 9, 0, 0, 0];
     let first =
         header.replace("element vertex", "element face 2\nproperty list uchar int vertex_indices\nelement vertex");
+    let lists = "element face 2\nproperty uchar flags\nproperty list uchar int vertex_indices\nproperty short material\n\
+                 property list ushort uchar edges\nproperty int last\nelement vertex";
+    let lists_first = |name: &str| format(name).replace("element vertex", lists);
+    let listed = [1, 2, 0, 0, 0, 0, 1, 0, 0, 0, 7, 0, 1, 0, 9, 5, 0, 0, 0, 0, 0, 7, 0, 2, 0, 8, 9, 5, 0, 0, 0];
+    let listed_big_endian =
+        [1, 2, 0, 0, 0, 0, 0, 0, 0, 1, 0, 7, 0, 1, 9, 0, 0, 0, 5, 0, 0, 0, 7, 0, 2, 8, 9, 0, 0, 0, 5];
     for (what, file) in [
         ("text", [format("ascii").as_bytes(), text.as_bytes()].concat()),
         ("big-endian", [format("binary_big_endian").as_bytes(), &big_endian].concat()),
@@ -140,6 +146,15 @@ fn every_format_gives_the_same_splats() {
         (
             "faces before in text",
             [first.replace("binary_little_endian", "ascii").as_bytes(), b"3 0 1 2\n1 9\n", text.as_bytes()].concat(),
+        ),
+        ("several lists", [lists_first("binary_little_endian").as_bytes(), &listed, rows].concat()),
+        (
+            "several lists, big-endian",
+            [lists_first("binary_big_endian").as_bytes(), &listed_big_endian, &big_endian].concat(),
+        ),
+        (
+            "several lists in text",
+            [lists_first("ascii").as_bytes(), b"1 2 0 1 7 1 9 5\n0 0 7 2 8 9 5\n", text.as_bytes()].concat(),
         ),
     ] {
         assert_eq!(
@@ -201,6 +216,17 @@ fn variants_of_other_programs_are_read() {
     let mut written = Vec::new();
     write_to(&mut written, &mip).unwrap();
     assert_eq!(from_bytes(&written).unwrap(), (mip, Vec::new()), "the mark is kept");
+    for (comments, is_antialiased) in [
+        ("comment antialiased 1\n", true),
+        ("comment antialiased 0\n", false),
+        ("comment antialiased 10\n", false),
+        ("comment SplatRenderMode: mip\ncomment antialiased 0\n", false),
+        ("comment SplatRenderMode: mip\ncomment SplatRenderMode: default\n", false),
+        ("comment antialiased 0\ncomment splatrendermode: MIP\ncomment other\n", true),
+    ] {
+        let (splats, _) = from_bytes(&one_splat(&[&GEOMETRY[..], &COEFFICIENTS].concat(), comments)).unwrap();
+        assert_eq!(splats.is_antialiased, is_antialiased, "{comments}");
+    }
     let short = one_splat(&[&GEOMETRY[..], &COEFFICIENTS].concat(), "");
     let row_end = short.len() - 5;
     let why = from_bytes(&[&short[..row_end], b"\n"].concat()).unwrap_err();
@@ -209,6 +235,9 @@ fn variants_of_other_programs_are_read() {
     assert_eq!(notes, ["5 bytes after the last row are not used"]);
     let points = from_bytes(&one_splat(&[&GEOMETRY[..3], &channels].concat(), "")).unwrap_err();
     assert!(points.starts_with("it is a point cloud or a mesh"), "{points}");
+    let mesh = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n\
+                element face 1\nproperty list uchar int vertex_indices\nproperty int flags\nend_header\n0 0 0\n1 0 5\n";
+    assert_eq!(from_bytes(mesh.as_bytes()).unwrap_err(), points);
     let higher: Vec<String> = (0..72).map(|ix| format!("f_rest_{ix}")).collect();
     let higher: Vec<(&str, &str)> = higher.iter().map(|name| (name.as_str(), "0.25")).collect();
     let (fourth, notes) = read(&[&GEOMETRY[..], &COEFFICIENTS, &higher].concat());

@@ -1,48 +1,36 @@
-//! Splats in `.spz` files (Niantic): reads versions 2 and 3, writes version 3.
+//! Splats in `.spz` files (Niantic): reads versions 2 to 4, writes version 3, which more programs read than version 4.
 //!
-//! The file is a gzip stream. It contains a header and the means, opacities, constant colors, scales, rotations and
-//! higher color coefficients of all splats. Each value is quantized to a few bits (`quantize.rs`).
+//! The file contains a header and the means, opacities, constant colors, scales, rotations and higher color coefficients
+//! of all splats, compressed (`container.rs`). Each value is quantized to a few bits (`quantize.rs`).
 //!
-//! The axes of `.spz` are right, up, back. Other programs interpret the axes of a `.ply`, which are also our axes, as
-//! right, down, front. Like those programs, we flip the signs of y and z, so that viewers show both files alike.
+//! The axes of `.spz` are right, up, back, unless an extension names other axes (`axes.rs`). Other programs interpret the
+//! axes of a `.ply`, which are also our axes, as right, down, front. Like those programs, we flip the signs of y and z, so
+//! that viewers show both files alike.
 //!
-//! Source: "SPZ file format", Niantic, versions 2 and 3, <https://github.com/nianticlabs/spz>.
+//! Source: "SPZ file format", Niantic, versions 2 to 4, <https://github.com/nianticlabs/spz>.
 
+mod axes;
+mod container;
 mod quantize;
 
 use crate::Error;
 use crate::splat::arrays::SplatArrays;
+use axes::Axes;
+use container::{Header, IS_ANTIALIASED, MAGIC, MAX_USED_SH_DEGREE};
 use flate2::Compression;
-use flate2::bufread::GzDecoder;
 use flate2::write::GzEncoder;
-use std::io::{ErrorKind, Read, Write};
+use std::io::Write;
 use std::path::Path;
 
-const MAGIC: [u8; 4] = *b"NGSP";
-const GZIP: [u8; 2] = [0x1f, 0x8b];
-const HEADER_BYTES: usize = 16;
-/// Oldest supported version. Version 1 stored means as 16-bit floats.
-const MIN_VERSION: u32 = 2;
-/// Newest supported version, and the version that is written. Later versions are not gzip streams.
-const MAX_VERSION: u32 = 3;
-/// Header flag: the splats were trained with the opacity correction of Mip-Splatting.
-const IS_ANTIALIASED: u8 = 1;
-/// Header flag: extensions follow the splats.
-const HAS_EXTENSIONS: u8 = 2;
-/// Maximum number of splats. A larger number in a header indicates damage.
-const MAX_SPLATS: u32 = 100_000_000;
-/// Maximum ratio of uncompressed to compressed size. Files of splats have 2 to 4.
-const MAX_COMPRESSION: u64 = 50;
-/// Uncompressed size that is accepted at any ratio.
-const ALWAYS_ACCEPTED_BYTES: u64 = 64 << 20;
+/// The version that is written.
+const WRITTEN_VERSION: u32 = 3;
 /// Maximum number of fractional bits of a mean, for steps of 15 micrometers.
 const MAX_FRACTIONAL_BITS: u8 = 16;
-/// Factors of the higher color coefficients when y and z change their signs: -1 for basis functions that change sign.
-const SH_SIGNS: [f32; 15] = [-1.0, -1.0, 1.0, -1.0, 1.0, 1.0, -1.0, 1.0, -1.0, 1.0, -1.0, -1.0, 1.0, -1.0, 1.0];
 
 /// Reads a `.spz` file of splats.
 pub fn read(path: &Path) -> Result<SplatArrays, Error> {
-    let bytes = files::read(path, files::NO_LIMIT).map_err(|source| Error::Read { path: path.to_owned(), source })?;
+    let bytes =
+        files::read(path, files::Budget::SPLATS).map_err(|source| Error::Read { path: path.to_owned(), source })?;
     let (splats, notes) = from_bytes(&bytes).map_err(|reason| Error::SplatFile { path: path.to_owned(), reason })?;
     for note in notes {
         log::warn!("{}: {note}", path.display());
@@ -63,143 +51,42 @@ pub fn write(path: &Path, splats: &SplatArrays) -> Result<(), Error> {
     written.map_err(|source| Error::Write { path: path.to_owned(), source })
 }
 
-/// The header of a file.
-struct Header {
-    version: u32,
-    n_splats: usize,
-    sh_degree: u32,
-    fractional_bits: u8,
-    flags: u8,
-}
-
-impl Header {
-    fn parse(bytes: [u8; HEADER_BYTES]) -> Result<Self, String> {
-        let word = |at: usize| u32::from_le_bytes([bytes[at], bytes[at + 1], bytes[at + 2], bytes[at + 3]]);
-        if bytes[..4] != MAGIC {
-            return Err("the decompressed data does not begin with \"NGSP\"".to_owned());
-        }
-        let (version, n_splats, [sh_degree, fractional_bits, flags, _]) =
-            (word(4), word(8), [bytes[12], bytes[13], bytes[14], bytes[15]]);
-        check_version(version)?;
-        if n_splats > MAX_SPLATS {
-            return Err(format!("the header specifies {n_splats} splats, expected at most {MAX_SPLATS}"));
-        }
-        if sh_degree > 3 {
-            return Err(format!("spherical harmonics of degree {sh_degree}, expected at most 3"));
-        }
-        if fractional_bits > 23 {
-            return Err(format!("means have {fractional_bits} fractional bits, expected at most 23"));
-        }
-        Ok(Self { version, n_splats: n_splats as usize, sh_degree: sh_degree.into(), fractional_bits, flags })
-    }
-
-    fn notes(&self, n_extension_bytes: u64) -> Vec<String> {
-        let mut notes = Vec::new();
-        if n_extension_bytes > 0 {
-            notes.push(format!("{n_extension_bytes} bytes of extensions are not used"));
-        }
-        let unknown = self.flags & !(IS_ANTIALIASED | HAS_EXTENSIONS);
-        if unknown != 0 {
-            notes.push(format!("the unknown header flags {unknown:#x} are not used"));
-        }
-        notes
-    }
-
-    fn n_higher_coefficients(&self) -> usize {
-        (self.sh_degree as usize + 1).pow(2) - 1
-    }
-
-    fn rotation_bytes(&self) -> usize {
-        if self.version == 2 { 3 } else { 4 }
-    }
-
-    /// Size of all splats in bytes.
-    fn n_body_bytes(&self) -> u64 {
-        self.n_splats as u64 * (16 + self.rotation_bytes() + 3 * self.n_higher_coefficients()) as u64
-    }
-}
-
-fn check_version(version: u32) -> Result<(), String> {
-    match version {
-        MIN_VERSION..=MAX_VERSION => Ok(()),
-        _ => Err(format!("format version {version}, expected {MIN_VERSION} or {MAX_VERSION}")),
-    }
-}
-
 /// The splats, and notes about what is not used.
 fn from_bytes(bytes: &[u8]) -> Result<(SplatArrays, Vec<String>), String> {
-    if let [b'N', b'G', b'S', b'P', version @ ..] = bytes
-        && let Some(version) = version.first_chunk()
-    {
-        check_version(u32::from_le_bytes(*version))?;
-    }
-    if !bytes.starts_with(&GZIP) {
-        return Err("not a gzip stream".to_owned());
-    }
-    let mut gzip = GzDecoder::new(bytes);
-    let mut header = [0; HEADER_BYTES];
-    gzip.read_exact(&mut header).map_err(|error| read_error(&error))?;
-    let header = Header::parse(header)?;
-    let max_body_bytes = ALWAYS_ACCEPTED_BYTES.max(MAX_COMPRESSION * bytes.len() as u64);
-    if header.n_body_bytes() > max_body_bytes {
-        return Err(format!(
-            "the header specifies {} splats, which a file of {} bytes cannot contain",
-            header.n_splats,
-            bytes.len()
-        ));
-    }
-    let mut body = Vec::new();
-    gzip.by_ref().take(header.n_body_bytes()).read_to_end(&mut body).map_err(|error| read_error(&error))?;
-    if (body.len() as u64) < header.n_body_bytes() {
-        let (n_splats, n_bytes) = (header.n_splats, header.n_body_bytes());
-        return Err(format!("truncated: {n_splats} splats need {n_bytes} bytes, found {}", body.len()));
-    }
-    // Reading to the end also verifies the checksum of the stream.
-    let n_more = std::io::copy(&mut gzip, &mut std::io::sink()).map_err(|error| read_error(&error))?;
-    if n_more > 0 && header.flags & HAS_EXTENSIONS == 0 {
-        return Err(format!("{n_more} bytes follow the last splat"));
-    }
-    match gzip.into_inner().len() {
-        0 => Ok((splats(&header, &body), header.notes(n_more))),
-        n => Err(format!("{n} bytes follow the gzip stream")),
-    }
-}
-
-fn read_error(error: &std::io::Error) -> String {
-    match error.kind() {
-        ErrorKind::UnexpectedEof => "truncated".to_owned(),
-        _ => format!("damaged ({error})"),
-    }
+    let contents = container::contents(bytes)?;
+    let (axes, n_used_bytes) = axes::from_extensions(&contents.extensions)?;
+    let notes = contents.header.notes(contents.n_extension_bytes - n_used_bytes);
+    Ok((splats(&contents.header, axes, &contents.body), notes))
 }
 
 /// Decodes the splats of a body whose length matches the header.
-fn splats(header: &Header, body: &[u8]) -> SplatArrays {
+fn splats(header: &Header, axes: Axes, body: &[u8]) -> SplatArrays {
     let n_splats = header.n_splats;
     let mut rest = body;
-    let mut next = |bytes_per_splat: usize| {
+    let [means, alphas, colors, scales, rotations, higher] = header.attribute_bytes().map(|bytes_per_splat| {
         let (array, after) = rest.split_at(n_splats * bytes_per_splat);
         rest = after;
         array
-    };
+    });
     let n_higher = header.n_higher_coefficients();
-    let [means, alphas, colors] = [9, 1, 3].map(&mut next);
-    let [scales, rotations, higher] = [3, header.rotation_bytes(), 3 * n_higher].map(&mut next);
-    let mut sh = Vec::with_capacity(n_splats * (n_higher + 1));
+    let sh_signs = axes.sh_signs();
+    let mut sh = Vec::with_capacity(n_splats * (n_higher.min(sh_signs.len()) + 1));
     for (splat_ix, color) in colors.as_chunks::<3>().0.iter().enumerate() {
         sh.push(color.map(quantize::color_from_byte));
         let coefficients = higher[3 * n_higher * splat_ix..][..3 * n_higher].as_chunks::<3>().0;
-        let signed = coefficients.iter().zip(SH_SIGNS);
+        // There are no signs for the coefficients of degree 4, which are left out.
+        let signed = coefficients.iter().zip(sh_signs);
         sh.extend(signed.map(|(rgb, sign)| rgb.map(|byte| sign * quantize::sh_from_byte(byte))));
     }
     let mean = |bytes: &[u8; 9]| {
         let [x, y, z] = [0, 3, 6].map(|at| [bytes[at], bytes[at + 1], bytes[at + 2]]);
-        flipped([x, y, z].map(|fixed| quantize::mean_from_fixed(fixed, header.fractional_bits)))
+        axes.vector([x, y, z].map(|fixed| quantize::mean_from_fixed(fixed, header.fractional_bits)))
     };
     let rotation = |xyzw: [f32; 4]| {
-        let [x, y, z] = flipped([xyzw[0], xyzw[1], xyzw[2]]);
+        let [x, y, z] = axes.rotation_xyz([xyzw[0], xyzw[1], xyzw[2]]);
         [xyzw[3], x, y, z]
     };
-    let rotations_wxyz = if header.version == 2 {
+    let rotations_wxyz = if header.has_short_rotations() {
         rotations.as_chunks().0.iter().map(|bytes| rotation(quantize::rotation_from_three(*bytes))).collect()
     } else {
         rotations.as_chunks().0.iter().map(|bytes| rotation(quantize::rotation_from_smallest(*bytes))).collect()
@@ -210,28 +97,27 @@ fn splats(header: &Header, body: &[u8]) -> SplatArrays {
         rotations_wxyz,
         opacity_logits: alphas.iter().map(|byte| quantize::opacity_logit_from_byte(*byte)).collect(),
         sh,
-        sh_degree: header.sh_degree,
-        is_antialiased: header.flags & IS_ANTIALIASED != 0,
+        sh_degree: header.sh_degree.min(MAX_USED_SH_DEGREE),
+        is_antialiased: header.is_antialiased(),
     }
-}
-
-/// Rotates by 180 degrees about x, which converts between our axes and those of the format.
-fn flipped([x, y, z]: [f32; 3]) -> [f32; 3] {
-    [x, -y, -z]
 }
 
 /// Encodes the header and the splats without compression.
 fn uncompressed_bytes(splats: &SplatArrays) -> Result<Vec<u8>, Error> {
-    let n_splats = u32::try_from(splats.n_splats()).ok().filter(|n| *n <= MAX_SPLATS).ok_or_else(|| {
-        Error::SplatArrays(format!("found {} splats, .spz holds at most {MAX_SPLATS}", splats.n_splats()))
+    let max_splats = files::Budget::SPLATS.max_elements;
+    let n_splats = u32::try_from(splats.n_splats()).ok().filter(|n| u64::from(*n) <= max_splats).ok_or_else(|| {
+        Error::SplatArrays(format!("found {} splats, .spz holds at most {max_splats}", splats.n_splats()))
     })?;
     let fractional_bits = fractional_bits(&splats.means)?;
+    let axes = Axes::RIGHT_UP_BACK;
+    let sh_signs = axes.sh_signs();
     let mut bytes = MAGIC.to_vec();
-    bytes.extend([MAX_VERSION, n_splats].map(u32::to_le_bytes).as_flattened());
+    bytes.extend([WRITTEN_VERSION, n_splats].map(u32::to_le_bytes).as_flattened());
     bytes.extend([u8::try_from(splats.sh_degree).expect("checked to be at most 3"), fractional_bits]);
     bytes.extend([if splats.is_antialiased { IS_ANTIALIASED } else { 0 }, 0]);
     for mean in &splats.means {
-        bytes.extend(flipped(*mean).map(|meters| quantize::fixed_from_mean(meters, fractional_bits)).as_flattened());
+        let fixed = axes.vector(*mean).map(|meters| quantize::fixed_from_mean(meters, fractional_bits));
+        bytes.extend(fixed.as_flattened());
     }
     bytes.extend(splats.opacity_logits.iter().map(|logit| quantize::byte_from_opacity_logit(*logit)));
     let n_coefficients = splats.n_coefficients();
@@ -242,11 +128,11 @@ fn uncompressed_bytes(splats: &SplatArrays) -> Result<Vec<u8>, Error> {
         bytes.extend(log_scale.map(quantize::byte_from_log_scale));
     }
     for [w, x, y, z] in &splats.rotations_wxyz {
-        let [x, y, z] = flipped([*x, *y, *z]);
+        let [x, y, z] = axes.rotation_xyz([*x, *y, *z]);
         bytes.extend(quantize::smallest_from_rotation([x, y, z, *w]));
     }
     for coefficients in splats.sh.chunks_exact(n_coefficients) {
-        for (rgb, sign) in coefficients[1..].iter().zip(SH_SIGNS) {
+        for (rgb, sign) in coefficients[1..].iter().zip(sh_signs) {
             bytes.extend(rgb.map(|value| quantize::byte_from_sh(sign * value)));
         }
     }

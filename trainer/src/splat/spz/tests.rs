@@ -1,9 +1,10 @@
 //! Tests of reading and writing `.spz` files.
 
+use super::container::{HAS_EXTENSIONS, HEADER_BYTES, LONG_HEADER_BYTES};
 use super::*;
-use crate::spherical_harmonics as sh;
 use crate::splat::cloud::synthetic_cloud;
-use nalgebra::{Quaternion, UnitQuaternion, Vector3};
+use nalgebra::{Quaternion, UnitQuaternion};
+use ruzstd::encoding::{CompressionLevel, compress_to_vec};
 
 /// A cloud of `n_splats` splats of this SH degree.
 fn cloud_of_degree(n_splats: usize, sh_degree: u32) -> SplatArrays {
@@ -17,6 +18,27 @@ fn packed(uncompressed: &[u8]) -> Vec<u8> {
     let mut gzip = GzEncoder::new(Vec::new(), Compression::default());
     gzip.write_all(uncompressed).unwrap();
     gzip.finish().unwrap()
+}
+
+/// Converts an uncompressed file of version 3 with less than 256 splats to version 4.
+fn zstd_file(uncompressed: &[u8], extensions: &[u8]) -> Vec<u8> {
+    let n_splats = usize::from(uncompressed[8]);
+    let n_higher = (usize::from(uncompressed[12]) + 1).pow(2) - 1;
+    let (mut table, mut streams) = (Vec::new(), Vec::new());
+    let mut rest = &uncompressed[HEADER_BYTES..];
+    for bytes_per_splat in [9, 1, 3, 3, 4, 3 * n_higher] {
+        let (attribute, after) = rest.split_at(n_splats * bytes_per_splat);
+        rest = after;
+        if !attribute.is_empty() {
+            let stream = compress_to_vec(attribute, CompressionLevel::Fastest);
+            table.extend([stream.len(), attribute.len()].map(|n_bytes| (n_bytes as u64).to_le_bytes()).concat());
+            streams.extend(stream);
+        }
+    }
+    let table_start = u32::try_from(LONG_HEADER_BYTES + extensions.len()).unwrap();
+    let mut header = uncompressed[..HEADER_BYTES].to_vec();
+    (header[4], header[15]) = (4, u8::try_from(table.len() / 16).unwrap());
+    [&header[..], &table_start.to_le_bytes(), &[0; 12], extensions, &table, &streams].concat()
 }
 
 fn quaternion(wxyz: [f32; 4]) -> UnitQuaternion<f64> {
@@ -134,20 +156,58 @@ fn one_splat_file_has_the_specified_bytes() {
     assert!(quaternion(decoded.rotations_wxyz[0]).angle_to(&quaternion(splat.rotations_wxyz[0])).to_degrees() < 1.5);
 }
 
-/// The color in a direction equals the color of the flipped splat in the flipped direction.
 #[test]
-fn colors_follow_the_axis_flip() {
-    let coefficients: Vec<[f64; 3]> = synthetic_cloud(1, 5).sh.iter().map(|rgb| rgb.map(f64::from)).collect();
-    let mut flipped_coefficients = coefficients.clone();
-    for (rgb, sign) in flipped_coefficients[1..].iter_mut().zip(SH_SIGNS) {
-        *rgb = rgb.map(|value| f64::from(sign) * value);
+fn every_container_gives_the_same_splats() {
+    for (n_splats, sh_degree) in [(5, 2), (3, 0), (0, 0)] {
+        let uncompressed = uncompressed_bytes(&cloud_of_degree(n_splats, sh_degree)).unwrap();
+        let expected = from_bytes(&packed(&uncompressed)).unwrap();
+        assert_eq!((expected.0.n_splats(), expected.1.len()), (n_splats, 0));
+        assert_eq!(from_bytes(&uncompressed).unwrap(), expected, "not compressed");
+        assert_eq!(from_bytes(&zstd_file(&uncompressed, &[])).unwrap(), expected, "version 4");
     }
-    for offset in [Vector3::new(0.3, -0.5, 0.8), Vector3::new(-0.9, 0.2, 0.1), Vector3::new(0.1, 0.7, -0.6)] {
-        let there = sh::color(&flipped_coefficients, &Vector3::new(offset.x, -offset.y, -offset.z));
-        for (here, there) in sh::color(&coefficients, &offset).iter().zip(there) {
-            assert!((here - there).abs() < 1e-12);
+}
+
+#[test]
+fn axes_of_an_extension_apply() {
+    // Type, size, and the number of the axes right, down, front, which are those of a `.ply`.
+    let axes = [0x03, 0x00, 0xbe, 0xad, 4, 0, 0, 0, 6, 0, 0, 0];
+    let mut uncompressed = uncompressed_bytes(&cloud_of_degree(5, 1)).unwrap();
+    let plain = from_bytes(&packed(&uncompressed)).unwrap().0;
+    let file_with_unused_extension = zstd_file(&uncompressed, &axes);
+    let note = "12 bytes of extensions are not used".to_owned();
+    assert_eq!(from_bytes(&file_with_unused_extension).unwrap(), (plain.clone(), vec![note]), "the flag is not set");
+    uncompressed[14] = HAS_EXTENSIONS;
+    let extended = [&uncompressed[..], &axes].concat();
+    for (what, file) in [
+        ("gzip", packed(&extended)),
+        ("not compressed", extended.clone()),
+        ("version 4", zstd_file(&uncompressed, &axes)),
+    ] {
+        let (splats, notes) = from_bytes(&file).unwrap();
+        assert!(notes.is_empty(), "{what}: {notes:?}");
+        for (ix, [x, y, z]) in plain.means.iter().enumerate() {
+            assert_eq!(splats.means[ix], [*x, -y, -z], "{what}");
+            let [w, x, y, z] = plain.rotations_wxyz[ix];
+            assert_eq!(splats.rotations_wxyz[ix], [w, x, -y, -z], "{what}");
+            let [constant, by_y, by_z, by_x] = plain.sh.as_chunks::<4>().0[ix];
+            let negated = |rgb: [f32; 3]| rgb.map(|value| -value);
+            assert_eq!(splats.sh[4 * ix..][..4], [constant, negated(by_y), negated(by_z), by_x], "{what}");
         }
     }
+}
+
+#[test]
+fn coefficients_of_degree_4_are_left_out() {
+    let degree_3 = uncompressed_bytes(&cloud_of_degree(2, 3)).unwrap();
+    let expected = from_bytes(&packed(&degree_3)).unwrap().0;
+    let (rest, coefficients) = degree_3.split_at(degree_3.len() - 2 * 45);
+    let mut degree_4 = rest.to_vec();
+    degree_4[12] = 4;
+    for of_splat in coefficients.chunks_exact(45) {
+        degree_4.extend([of_splat, &[200; 27]].concat());
+    }
+    let note = "its color coefficients above degree 3 are not used".to_owned();
+    assert_eq!(from_bytes(&packed(&degree_4)).unwrap(), (expected, vec![note]));
 }
 
 #[test]
@@ -161,17 +221,17 @@ fn broken_files_are_rejected_with_the_reason() {
         uncompressed[at] = to;
         error_of(&packed(&uncompressed))
     };
-    assert_eq!(error_of(b"ply\n"), "not a gzip stream");
-    assert_eq!(error_of(b""), "not a gzip stream");
-    assert_eq!(error_of(b"NGSP\x04\0\0\0rest"), "format version 4, expected 2 or 3");
-    assert!(error_of(&uncompressed).contains("gzip"));
+    assert_eq!(error_of(b"ply\n"), "it begins neither with a gzip stream nor with \"NGSP\"");
+    assert_eq!(error_of(b""), "it begins neither with a gzip stream nor with \"NGSP\"");
+    assert_eq!(error_of(b"NGSP\x05\0\0\0and so on"), "format version 5, expected 2 to 4");
     assert_eq!(error_with_byte(0, b'X'), "the decompressed data does not begin with \"NGSP\"");
-    assert_eq!(error_with_byte(4, 1), "format version 1, expected 2 or 3");
+    assert_eq!(error_with_byte(4, 1), "format version 1, expected 2 to 4");
+    assert_eq!(error_with_byte(4, 4), "a gzip stream of format version 4, which has no gzip stream");
     assert_eq!(error_with_byte(8, 6), "truncated: 6 splats need 264 bytes, found 220");
     assert_eq!(error_with_byte(8, 4), "44 bytes follow the last splat");
     assert!(error_with_byte(11, 255).contains("4278190085 splats, expected at most 100000000"));
     assert!(error_with_byte(11, 5).contains("specifies 83886085 splats, which a file of"));
-    assert_eq!(error_with_byte(12, 4), "spherical harmonics of degree 4, expected at most 3");
+    assert_eq!(error_with_byte(12, 5), "spherical harmonics of degree 5, expected at most 4");
     assert!(error_with_byte(12, 3).contains("truncated"));
     assert!(error_with_byte(13, 32).contains("32 fractional bits"));
     assert_eq!(error_of(&packed(&uncompressed[..7])), "truncated");
@@ -187,6 +247,42 @@ fn broken_files_are_rejected_with_the_reason() {
     assert_eq!(error_of(&packed(&extended)), "23 bytes follow the last splat");
     extended[14] = HAS_EXTENSIONS;
     assert_eq!(from_bytes(&packed(&extended)).unwrap().1.len(), 1, "extensions are named");
+}
+
+#[test]
+fn broken_uncompressed_files_are_rejected_with_the_reason() {
+    let whole = uncompressed_bytes(&cloud_of_degree(5, 2)).unwrap();
+    let error_of = |bytes: &[u8]| from_bytes(bytes).unwrap_err();
+    for length in 4..whole.len() {
+        assert!(error_of(&whole[..length]).starts_with("truncated"), "{length} of {} bytes", whole.len());
+    }
+    assert_eq!(error_of(&whole[..whole.len() - 1]), "truncated: 5 splats need 220 bytes, found 219");
+    assert_eq!(error_of(&[&whole[..], b"tail"].concat()), "4 bytes follow the last splat");
+}
+
+#[test]
+fn broken_files_of_version_4_are_rejected_with_the_reason() {
+    let whole = zstd_file(&uncompressed_bytes(&cloud_of_degree(5, 2)).unwrap(), &[]);
+    let error_of = |bytes: &[u8]| from_bytes(bytes).unwrap_err();
+    let error_with_byte = |at: usize, to: u8| {
+        let mut damaged = whole.clone();
+        damaged[at] = to;
+        error_of(&damaged)
+    };
+    for length in 4..whole.len() {
+        assert_eq!(error_of(&whole[..length]), "truncated", "{length} of {} bytes", whole.len());
+    }
+    let n_bytes = whole.len();
+    assert_eq!(error_with_byte(8, 4), "stream 0 has 45 uncompressed bytes, expected 36");
+    assert!(error_with_byte(11, 5).contains("specifies 83886085 splats, which a file of"));
+    assert_eq!(error_with_byte(12, 3), "stream 5 has 120 uncompressed bytes, expected 225");
+    assert_eq!(error_with_byte(15, 5), "5 streams, expected 6");
+    assert_eq!(error_with_byte(16, 31), format!("the table of streams begins at byte 31, expected 32 to {n_bytes}"));
+    assert!(error_with_byte(19, 255).starts_with("the table of streams begins at byte 4278190112"));
+    assert_eq!(error_with_byte(39, 255), "truncated", "stream 0 is longer than the file");
+    let first_stream = LONG_HEADER_BYTES + 6 * 16;
+    assert!(error_with_byte(first_stream, 0).starts_with("stream 0 is damaged ("));
+    assert_eq!(error_of(&[&whole[..], b"tail"].concat()), "4 bytes follow the last stream");
 }
 
 #[test]
@@ -221,13 +317,11 @@ fn unsupported_values_are_rejected() {
 #[test]
 fn files_of_another_program_are_read() {
     let Some(folder) = test_support::data_folder("splats") else { return };
-    for name in ["minimal-v2.spz", "minimal-v3.spz"] {
+    for name in ["minimal-v2.spz", "minimal-raw.spz", "minimal-v3.spz", "minimal-v4.spz"] {
         let splats = read(&folder.join(name)).unwrap();
         assert_eq!((splats.n_splats(), splats.sh_degree), (4, 0), "{name}");
         assert!(splats.means.as_flattened().iter().all(|meters| [0.0, 1.0, -1.0].contains(meters)), "{name}");
         assert!(splats.log_scales.as_flattened().iter().all(|scale| (scale - 0.1_f32.ln()).abs() < 0.04), "{name}");
         assert!(splats.rotations_wxyz.iter().all(|wxyz| wxyz[0] > 0.999), "{name}: all are identity");
     }
-    let newer = read(&folder.join("minimal-v4.spz")).unwrap_err().to_string();
-    assert!(newer.ends_with("format version 4, expected 2 or 3"), "{newer}");
 }

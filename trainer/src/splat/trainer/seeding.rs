@@ -1,6 +1,7 @@
 //! Seeds splats on the surfaces visible in new keyframes.
 
 use super::view_set::ViewSet;
+use crate::InitialPoints;
 use crate::model_options::ModelOptions;
 use crate::splat::arrays::SplatArrays;
 use crate::splat::options::SplatOptions;
@@ -29,6 +30,8 @@ pub(super) struct Seeding {
     /// Keyframes without dense depth that arrived since the last step.
     unseeded: Vec<Arc<Keyframe>>,
     density: Density,
+    /// Points from which training starts if no keyframe has depth.
+    pub(super) points: Option<Arc<InitialPoints>>,
 }
 
 impl Seeding {
@@ -41,6 +44,7 @@ impl Seeding {
             pending: Vec::new(),
             unseeded: Vec::new(),
             density: Density { max_discs, px_per_disc: PX_PER_SEED },
+            points: None,
         }
     }
 
