@@ -14,7 +14,7 @@ const BUNDLE: [&str; 5] = [
     "web/dist/app.css",
 ];
 /// The page of binaries built without Node.js.
-const WITHOUT_BUNDLE: [&str; 2] = ["src/without_bundle.html", "src/without_bundle.css"];
+const WITHOUT_BUNDLE: [&str; 2] = ["src/server/without_bundle.html", "src/server/without_bundle.css"];
 
 fn main() -> std::io::Result<()> {
     println!("cargo::rustc-check-cfg=cfg(web_bundle)");

@@ -1,8 +1,8 @@
 //! Serves the hub's data as topics to Foxglove, on a separate thread and port.
 
-use crate::picture::live_jpeg;
-use crate::robot::{RobotDescription, RobotState};
-use crate::updates::{KeyframePose, LiveImage, Status};
+use crate::pictures::picture::live_jpeg;
+use crate::topics::robot::{RobotDescription, RobotState};
+use crate::topics::updates::{KeyframePose, LiveImage, Status};
 use crate::{Error, Hub};
 use ::foxglove::messages::{
     CameraCalibration, CompressedImage, FrameTransform, FrameTransforms, JointState, JointStates, Pose, PosesInFrame,

@@ -1,22 +1,22 @@
 //! Shared state of the training thread and the server. The training thread never waits for a client.
 
-use crate::access::Role;
-use crate::base_path::BasePath;
-use crate::chunk_list::ChunkList;
 use crate::edit::EditRequest;
-use crate::observation_map::{ObservationMap, PackedObservations};
-use crate::picture::packing;
-use crate::picture_times::{SentPicture, ShownPicture, ShownPictures, TrainedKeyframes};
+use crate::pictures::picture::packing;
+use crate::pictures::picture_times::{SentPicture, ShownPicture, ShownPictures, TrainedKeyframes};
+use crate::pictures::queue::{DrawnPicture, Outgoing, Queue, RenderJob};
+use crate::pictures::view_request::ViewRequest;
+use crate::pictures::viewpoint::Viewpoint;
 use crate::pose::row_major;
-use crate::protocol::{Control, ProjectionMessage};
-use crate::queue::{DrawnPicture, Outgoing, Queue, RenderJob};
-use crate::range_scan::RangeScan;
-use crate::robot::{RobotDescription, RobotState};
-use crate::server_message::PictureHeader;
-use crate::subscriptions::Subscriptions;
-use crate::updates::{KeyframePose, LiveImage, RunResult, SceneHint, Status};
-use crate::view_request::ViewRequest;
-use crate::viewpoint::Viewpoint;
+use crate::server::access::Role;
+use crate::session::protocol::{Control, ProjectionMessage};
+use crate::session::server_message::PictureHeader;
+use crate::topics::base_path::BasePath;
+use crate::topics::chunk_list::ChunkList;
+use crate::topics::observation_map::{ObservationMap, PackedObservations};
+use crate::topics::range_scan::RangeScan;
+use crate::topics::robot::{RobotDescription, RobotState};
+use crate::topics::subscriptions::Subscriptions;
+use crate::topics::updates::{KeyframePose, LiveImage, RunResult, SceneHint, Status};
 use keyframe::Keyframe;
 use kinematics::{Stamp, Transform};
 use parking_lot::{Condvar, Mutex, MutexGuard};

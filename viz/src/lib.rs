@@ -12,67 +12,35 @@
 //! assert!(hub.next_request().is_none(), "nobody requests a picture yet");
 //! ```
 
-mod access;
-mod admission;
-mod base_path;
-mod broadcast;
-mod certificate;
-mod chunk_list;
-mod chunk_sender;
-mod client_log;
-mod client_updates;
 mod clock;
-mod compact_depth;
 mod edit;
 mod error;
 #[cfg(feature = "foxglove")]
 mod foxglove_server;
 mod hub;
-mod jpeg;
-mod keyframe_log;
-mod keyframe_points;
-mod link_rate;
-#[cfg(any(test, fuzzing))]
-mod message_checks;
-mod negotiation;
-mod observation_map;
-mod page;
-mod picture;
-mod picture_times;
+mod pictures;
 mod pose;
-mod positions;
-mod protocol;
-mod queue;
-mod range_scan;
-mod robot;
 mod server;
-mod server_context;
-mod server_message;
 mod session;
-mod subscriptions;
-mod tls;
-mod updates;
-mod view_request;
-mod viewpoint;
-mod writer;
+mod topics;
 
-pub use access::{Role, Token, Tokens};
-pub use certificate::Certificate;
 pub use edit::{EditAction, EditRequest};
 pub use error::Error;
 #[cfg(feature = "foxglove")]
 pub use foxglove_server::FoxgloveServer;
 pub use hub::{Hub, PendingRender};
-pub use observation_map::{ObservationMap, ObservedCell};
-pub use picture_times::{NewestKeyframe, ShownPicture, TrainedKeyframes};
-pub use protocol::{BASE_PROTOCOL_VERSION, Control, PROTOCOL_VERSION};
-pub use range_scan::RangeScan;
-pub use robot::{MeshFormat, RobotDescription, RobotMesh, RobotState};
+pub use pictures::picture_times::{NewestKeyframe, ShownPicture, TrainedKeyframes};
+pub use server::access::{Role, Token, Tokens};
+pub use server::certificate::Certificate;
 pub use server::{Server, ServerConfig, Sharing};
-pub use updates::{Guidance, KeyframePose, LiveImage, LivePixels, ModelStatus, RunResult, SceneHint, Status};
+pub use session::protocol::{BASE_PROTOCOL_VERSION, Control, PROTOCOL_VERSION};
+pub use topics::observation_map::{ObservationMap, ObservedCell};
+pub use topics::range_scan::RangeScan;
+pub use topics::robot::{MeshFormat, RobotDescription, RobotMesh, RobotState};
+pub use topics::updates::{Guidance, KeyframePose, LiveImage, LivePixels, ModelStatus, RunResult, SceneHint, Status};
 
 /// Handles the messages of a client, one per line, and panics if a result is inconsistent.
 #[cfg(fuzzing)]
 pub fn check_session(session: &str) {
-    message_checks::check_session(session);
+    session::message_checks::check_session(session);
 }

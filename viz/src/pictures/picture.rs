@@ -1,16 +1,16 @@
 //! Packs pictures and live images into binary messages.
 
 use crate::clock::ServerClock;
-use crate::compact_depth::{Effort, compress};
-use crate::jpeg::{Chroma, JpegError, Layout, Pixels, downscale, encode, n_threads};
-use crate::picture_times::TrainedKeyframes;
-use crate::protocol::DepthFormat;
-use crate::queue::{DrawnPicture, RenderJob};
-use crate::server_message::{
+use crate::pictures::compact_depth::{Effort, compress};
+use crate::pictures::jpeg::{Chroma, JpegError, Layout, Pixels, downscale, encode, n_threads};
+use crate::pictures::picture_times::TrainedKeyframes;
+use crate::pictures::queue::{DrawnPicture, RenderJob};
+use crate::pictures::view_request::ViewRequest;
+use crate::session::protocol::DepthFormat;
+use crate::session::server_message::{
     BinaryHeader, ColorPart, DepthPart, LiveHeader, NewestKeyframeMessage, PictureHeader, frame,
 };
-use crate::updates::{LiveImage, LivePixels};
-use crate::view_request::ViewRequest;
+use crate::topics::updates::{LiveImage, LivePixels};
 use std::borrow::Cow;
 use std::time::Instant;
 use trainer::{JPEG_QUALITY, PackedDepth, Packing, Picture, Rendered};
@@ -251,7 +251,7 @@ fn write_counts(depth_m: &[f32], counts_per_meter: f64, packed: &mut [u8]) {
 mod tests {
     use super::{half_depth, pack_live_image};
     use crate::clock::ServerClock;
-    use crate::updates::{LiveImage, LivePixels};
+    use crate::topics::updates::{LiveImage, LivePixels};
     use kinematics::Stamp;
     use std::time::Instant;
     use trainer::{PackedDepth, Picture};
@@ -357,15 +357,20 @@ mod tests {
                     .min_by(|a, b| a.1.total_cmp(&b.1))
                     .expect("15 runs")
             };
-            let pixels = crate::jpeg::Pixels { size_px, layout: crate::jpeg::Layout::Rgba, bytes: &picture.rgba_srgb };
-            use crate::jpeg::Chroma;
+            let pixels = crate::pictures::jpeg::Pixels {
+                size_px,
+                layout: crate::pictures::jpeg::Layout::Rgba,
+                bytes: &picture.rgba_srgb,
+            };
+            use crate::pictures::jpeg::Chroma;
             for (name, quality, chroma) in
                 [("4:4:4 q92", 92, Chroma::Full), ("4:2:0 q92", 92, Chroma::Halved), ("4:2:0 q80", 80, Chroma::Halved)]
             {
-                let (bytes, millis) = best(&|| crate::jpeg::encode(&pixels, quality, chroma).expect("encoded").len());
+                let (bytes, millis) =
+                    best(&|| crate::pictures::jpeg::encode(&pixels, quality, chroma).expect("encoded").len());
                 println!("{size_px:?} color {name}: {millis:.2} ms, {bytes} bytes");
             }
-            let (bytes, millis) = best(&|| half_depth(&picture, crate::jpeg::n_threads()).counts.len());
+            let (bytes, millis) = best(&|| half_depth(&picture, crate::pictures::jpeg::n_threads()).counts.len());
             println!("{size_px:?} depth u16_half: {millis:.2} ms, {bytes} bytes");
             let (bytes, millis) = best(&|| {
                 let rgb: Vec<u8> =

@@ -1,11 +1,11 @@
 //! Decides which chunk of a model a client receives next: first all chunks coarsely, then all in full, then the chunks
 //! that have changed most, within a budget. While the client's copy is incomplete, chunks in its view come first.
 
-use crate::chunk_list::{ChunkList, VersionedChunk};
+use crate::pictures::viewpoint::Viewpoint;
 use crate::pose::row_major;
-use crate::server_message::{BinaryHeader, ChunkHeader, ServerMessage, frame};
-use crate::subscriptions::ChunkSubscription;
-use crate::viewpoint::Viewpoint;
+use crate::session::server_message::{BinaryHeader, ChunkHeader, ServerMessage, frame};
+use crate::topics::chunk_list::{ChunkList, VersionedChunk};
+use crate::topics::subscriptions::ChunkSubscription;
 use axum::extract::ws::Message;
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -151,11 +151,11 @@ fn most_changed<'a>(
 #[cfg(test)]
 mod tests {
     use super::{ChunkSender, NextChunk};
-    use crate::chunk_list::ChunkList;
-    use crate::chunk_list::tests::{chunk, complete};
-    use crate::subscriptions::ChunkSubscription;
-    use crate::viewpoint::Viewpoint;
-    use crate::viewpoint::tests::{cube, viewpoint};
+    use crate::pictures::viewpoint::Viewpoint;
+    use crate::pictures::viewpoint::tests::{cube, viewpoint};
+    use crate::topics::chunk_list::ChunkList;
+    use crate::topics::chunk_list::tests::{chunk, complete};
+    use crate::topics::subscriptions::ChunkSubscription;
     use axum::extract::ws::Message;
     use serde_json::Value;
     use std::time::{Duration, Instant};

@@ -1,9 +1,9 @@
 //! What all sessions of a server share.
 
 use crate::Hub;
-use crate::broadcast::LatestMessages;
-use crate::client_log::ClientLog;
 use crate::clock::ServerClock;
+use crate::server::client_log::ClientLog;
+use crate::topics::broadcast::LatestMessages;
 use std::sync::Arc;
 use tokio::sync::watch;
 

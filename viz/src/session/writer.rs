@@ -4,21 +4,21 @@
 //! parts and the kernel's buffer are so small that their transfer takes less than 100 ms. Everything else waits here,
 //! where newer data replaces older data.
 
-use crate::access::Role;
-use crate::admission::Connection;
-use crate::client_updates::{ClientUpdates, Next};
-use crate::compact_depth::Effort;
 use crate::hub::Demand;
-use crate::link_rate::LinkRate;
-use crate::negotiation::{Agreement, CAPABILITIES, Negotiated};
-use crate::picture::{PackError, PackedPicture, pack_picture};
-use crate::picture_times::SentPicture;
-use crate::protocol::{BASE_PROTOCOL_VERSION, PROTOCOL_VERSION};
-use crate::queue::{DrawnPicture, Outgoing};
-use crate::robot::RobotStateMessage;
-use crate::server_context::ServerContext;
-use crate::server_message::{BinaryHeader, PartHeader, ServerMessage, frame};
-use crate::view_request::{DEFAULT_STAGES, MAX_SIZE_PX};
+use crate::pictures::compact_depth::Effort;
+use crate::pictures::picture::{PackError, PackedPicture, pack_picture};
+use crate::pictures::picture_times::SentPicture;
+use crate::pictures::queue::{DrawnPicture, Outgoing};
+use crate::pictures::view_request::{DEFAULT_STAGES, MAX_SIZE_PX};
+use crate::server::access::Role;
+use crate::server::admission::Connection;
+use crate::server::server_context::ServerContext;
+use crate::session::link_rate::LinkRate;
+use crate::session::negotiation::{Agreement, CAPABILITIES, Negotiated};
+use crate::session::protocol::{BASE_PROTOCOL_VERSION, PROTOCOL_VERSION};
+use crate::session::server_message::{BinaryHeader, PartHeader, ServerMessage, frame};
+use crate::topics::client_updates::{ClientUpdates, Next};
+use crate::topics::robot::RobotStateMessage;
 use axum::body::Bytes;
 use axum::extract::ws::{Message, WebSocket};
 use futures_util::SinkExt;

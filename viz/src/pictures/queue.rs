@@ -1,11 +1,11 @@
 //! Render requests by client and view: the newest request of each view, stage by stage. Clients take turns, and so do
 //! the views of a client.
 
-use crate::access::Role;
-use crate::picture_times::{TrainedKeyframes, UnreportedPictures};
-use crate::protocol::DepthFormat;
-use crate::server_message::PictureHeader;
-use crate::view_request::ViewRequest;
+use crate::pictures::picture_times::{TrainedKeyframes, UnreportedPictures};
+use crate::pictures::view_request::ViewRequest;
+use crate::server::access::Role;
+use crate::session::protocol::DepthFormat;
+use crate::session::server_message::PictureHeader;
 use std::collections::{BTreeMap, VecDeque};
 use std::ops::Bound;
 use std::sync::Arc;
@@ -276,9 +276,9 @@ fn n_px_of_last_stage(view_request: &ViewRequest) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::{CLIENT_BYTES, MAX_OUTBOX, Outgoing, Queue, SHARED_BYTES};
-    use crate::access::Role;
-    use crate::protocol::{DepthFormat, RenderMessage};
-    use crate::view_request::ViewRequest;
+    use crate::pictures::view_request::ViewRequest;
+    use crate::server::access::Role;
+    use crate::session::protocol::{DepthFormat, RenderMessage};
 
     fn view_request(id: u64) -> ViewRequest {
         let message: RenderMessage = serde_json::from_value(serde_json::json!({

@@ -3,13 +3,13 @@
 
 use crate::clock::ServerClock;
 use crate::edit::{EditAction, EditRequest};
-use crate::negotiation::{CAPABILITIES, negotiate};
-use crate::protocol::{
+use crate::pictures::view_request::{MAX_SIZE_PX, ViewRequest};
+use crate::session::negotiation::{CAPABILITIES, negotiate};
+use crate::session::protocol::{
     BASE_PROTOCOL_VERSION, ClientHello, ClientMessage, EditMessage, MAX_RATE_HZ, PROTOCOL_VERSION, RenderMessage,
     ShownMessage, SubscribeMessage,
 };
-use crate::subscriptions::{Subscriptions, fitted};
-use crate::view_request::{MAX_SIZE_PX, ViewRequest};
+use crate::topics::subscriptions::{Subscriptions, fitted};
 use trainer::{Aabb, Projection, RenderRequest};
 
 /// Handles the messages of a session, one per line, and panics if a result is inconsistent.

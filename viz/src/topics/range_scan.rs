@@ -1,7 +1,7 @@
 //! Scans of range scanners, for viewers.
 
-use crate::positions::pack_positions;
-use crate::server_message::{BinaryHeader, RangeScanHeader, frame};
+use crate::session::server_message::{BinaryHeader, RangeScanHeader, frame};
+use crate::topics::positions::pack_positions;
 use keyframe::RangePoints;
 use kinematics::Transform;
 use nalgebra::{Point3, Vector3};

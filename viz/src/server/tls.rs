@@ -1,6 +1,6 @@
 //! TLS handshakes of shared servers.
 
-use crate::admission::GuardedStream;
+use crate::server::admission::GuardedStream;
 use std::io;
 use std::time::Duration;
 use tokio::io::AsyncWriteExt;

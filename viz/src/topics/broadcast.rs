@@ -3,14 +3,14 @@
 use crate::Hub;
 use crate::clock::ServerClock;
 use crate::hub::{Demand, LiveImages, ModelLists, RangeScans};
-use crate::keyframe_log::KeyframeLog;
-use crate::keyframe_points::pack_points;
-use crate::picture::pack_live_image;
-use crate::range_scan::pack_range_scan;
-use crate::robot::RobotMessage;
-use crate::server_message::{KeyframeMessage, ServerMessage};
-use crate::subscriptions::fitted;
-use crate::updates::LiveImage;
+use crate::pictures::picture::pack_live_image;
+use crate::session::server_message::{KeyframeMessage, ServerMessage};
+use crate::topics::keyframe_log::KeyframeLog;
+use crate::topics::keyframe_points::pack_points;
+use crate::topics::range_scan::pack_range_scan;
+use crate::topics::robot::RobotMessage;
+use crate::topics::subscriptions::fitted;
+use crate::topics::updates::LiveImage;
 use axum::extract::ws::Message;
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -387,7 +387,7 @@ impl Throttle {
 #[cfg(test)]
 mod tests {
     use super::{ImageEncoding, ImageKey, MAX_IMAGE_ENCODINGS, images_to_encode};
-    use crate::updates::{LiveImage, LivePixels};
+    use crate::topics::updates::{LiveImage, LivePixels};
     use kinematics::Stamp;
     use std::collections::{BTreeMap, BTreeSet};
     use std::sync::Arc;

@@ -27,11 +27,11 @@ macro_rules! page_file {
 /// The page bundled by `scripts/build-web.sh`.
 #[cfg(web_bundle)]
 pub(crate) const FILES: &[PageFile] = &[
-    page_file!("/", "text/html; charset=utf-8", "../web/dist/", "index.html"),
-    page_file!("/app.js", "text/javascript; charset=utf-8", "../web/dist/", "app.js"),
-    page_file!("/splat_worker.js", "text/javascript; charset=utf-8", "../web/dist/", "splat_worker.js"),
-    page_file!("/video_worker.js", "text/javascript; charset=utf-8", "../web/dist/", "video_worker.js"),
-    page_file!("/app.css", "text/css; charset=utf-8", "../web/dist/", "app.css"),
+    page_file!("/", "text/html; charset=utf-8", "../../web/dist/", "index.html"),
+    page_file!("/app.js", "text/javascript; charset=utf-8", "../../web/dist/", "app.js"),
+    page_file!("/splat_worker.js", "text/javascript; charset=utf-8", "../../web/dist/", "splat_worker.js"),
+    page_file!("/video_worker.js", "text/javascript; charset=utf-8", "../../web/dist/", "video_worker.js"),
+    page_file!("/app.css", "text/css; charset=utf-8", "../../web/dist/", "app.css"),
 ];
 
 /// The page of binaries built without Node.js.
@@ -111,7 +111,7 @@ mod tests {
 
     /// Id and title of each button of the page.
     fn buttons() -> Vec<(&'static str, &'static str)> {
-        let tags = include_str!("../web/src/index.html").split("<button ").skip(1);
+        let tags = include_str!("../../web/src/index.html").split("<button ").skip(1);
         let attribute = |tag: &'static str, name: &str| Some(tag.split_once(name)?.1.split_once('"')?.0);
         tags.filter_map(|tag| {
             let tag = tag.split_once('>')?.0;
@@ -127,8 +127,8 @@ mod tests {
 
     #[test]
     fn keys_in_titles_are_unique_and_have_actions() {
-        let main = include_str!("../web/src/main.ts");
-        let help = include_str!("../web/src/help.ts");
+        let main = include_str!("../../web/src/main.ts");
+        let help = include_str!("../../web/src/help.ts");
         let keys: Vec<_> = buttons().into_iter().filter_map(|(id, title)| Some((id, key_of(title)?))).collect();
         assert!(keys.len() > 20, "{keys:?}");
         for (ix, (id, key)) in keys.iter().enumerate() {

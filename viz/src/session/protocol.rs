@@ -1,6 +1,6 @@
 //! The messages from clients, as in `docs/reference/protocol.md`.
 
-use crate::access::Role;
+use crate::server::access::Role;
 use serde::{Deserialize, Serialize};
 
 /// Newest protocol version of the server.

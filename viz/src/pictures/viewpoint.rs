@@ -1,6 +1,6 @@
 //! Where a client looks from, and in which direction. It decides which chunks of a model the client gets first.
 
-use crate::view_request::ViewRequest;
+use crate::pictures::view_request::ViewRequest;
 use kinematics::Transform;
 use nalgebra::{Point3, Vector3};
 use trainer::{ChunkLayout, MAX_MESH_COUNT, Projection};
@@ -58,7 +58,7 @@ fn bounds(layout: &ChunkLayout) -> (Point3<f64>, f64) {
 #[cfg(test)]
 pub(crate) mod tests {
     use super::Viewpoint;
-    use crate::view_request::ViewRequest;
+    use crate::pictures::view_request::ViewRequest;
     use kinematics::Transform;
     use serde_json::json;
     use trainer::{ChunkLayout, MAX_MESH_COUNT};

@@ -1,10 +1,10 @@
 //! Decides which update a client receives next, according to its subscriptions.
 
-use crate::broadcast::{Item, LatestMessages};
-use crate::chunk_sender::{ChunkSender, NextChunk};
-use crate::keyframe_log::{Changes, ListPosition};
-use crate::subscriptions::Subscriptions;
-use crate::viewpoint::Viewpoint;
+use crate::pictures::viewpoint::Viewpoint;
+use crate::topics::broadcast::{Item, LatestMessages};
+use crate::topics::chunk_sender::{ChunkSender, NextChunk};
+use crate::topics::keyframe_log::{Changes, ListPosition};
+use crate::topics::subscriptions::Subscriptions;
 use axum::extract::ws::Message;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -292,11 +292,11 @@ fn newer(item: Option<&Item>, number: &mut u64) -> Option<Message> {
 #[cfg(test)]
 mod tests {
     use super::{ClientUpdates, Next};
-    use crate::broadcast::{Item, LatestMessages};
-    use crate::keyframe_log::KeyframeLog;
-    use crate::protocol::SubscribeMessage;
-    use crate::subscriptions::Subscriptions;
-    use crate::updates::KeyframePose;
+    use crate::session::protocol::SubscribeMessage;
+    use crate::topics::broadcast::{Item, LatestMessages};
+    use crate::topics::keyframe_log::KeyframeLog;
+    use crate::topics::subscriptions::Subscriptions;
+    use crate::topics::updates::KeyframePose;
     use axum::extract::ws::Message;
     use kinematics::{Stamp, Transform};
     use serde_json::{Value, json};

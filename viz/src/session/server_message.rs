@@ -1,11 +1,11 @@
 //! The messages from the server, as in `docs/reference/protocol.md`.
 
-use crate::access::Role;
 use crate::clock::ServerClock;
 use crate::pose::row_major;
-use crate::protocol::{DepthFormat, ProjectionMessage};
-use crate::robot::{RobotMessage, RobotStateMessage};
-use crate::updates::{KeyframePose, LiveImage, SceneHint, Status};
+use crate::server::access::Role;
+use crate::session::protocol::{DepthFormat, ProjectionMessage};
+use crate::topics::robot::{RobotMessage, RobotStateMessage};
+use crate::topics::updates::{KeyframePose, LiveImage, SceneHint, Status};
 use serde::Serialize;
 use trainer::ChunkLayout;
 

@@ -1,7 +1,7 @@
 //! The depth of a keyframe as colored points, for viewers.
 
-use crate::positions::pack_positions;
-use crate::server_message::{BinaryHeader, PointsHeader, frame};
+use crate::session::server_message::{BinaryHeader, PointsHeader, frame};
+use crate::topics::positions::pack_positions;
 use keyframe::{DepthMap, Keyframe};
 use nalgebra::{Point3, Vector3};
 

@@ -1,15 +1,23 @@
 //! Serves the page, the status and the WebSocket on one port, on a separate thread.
 
-use crate::access::{Access, Role, Tokens};
-use crate::admission::{Admission, Connection, GuardedStream, Limits};
-use crate::broadcast::broadcast;
-use crate::certificate::Certificate;
-use crate::client_log::ClientLog;
+pub(crate) mod access;
+pub(crate) mod admission;
+pub(crate) mod certificate;
+pub(crate) mod client_log;
+mod page;
+pub(crate) mod server_context;
+mod tls;
+
 use crate::clock::ServerClock;
-use crate::page::{FILES, has_version};
-use crate::protocol::MAX_MESSAGE_BYTES;
-use crate::server_context::ServerContext;
-use crate::{Error, Hub, Status, session, tls};
+use crate::server::access::{Access, Role, Tokens};
+use crate::server::admission::{Admission, Connection, GuardedStream, Limits};
+use crate::server::certificate::Certificate;
+use crate::server::client_log::ClientLog;
+use crate::server::page::{FILES, has_version};
+use crate::server::server_context::ServerContext;
+use crate::session::protocol::MAX_MESSAGE_BYTES;
+use crate::topics::broadcast::broadcast;
+use crate::{Error, Hub, Status, session};
 use axum::extract::{Extension, Path, Request, State, WebSocketUpgrade};
 use axum::http::{HeaderMap, HeaderName, HeaderValue, StatusCode, header};
 use axum::middleware::{Next, from_fn, from_fn_with_state};
@@ -162,7 +170,7 @@ async fn serve(
     set_socket_options(&listener);
     let listener = tokio::net::TcpListener::from_std(listener)?;
     let clock = ServerClock::start();
-    let (latest_messages_sender, latest_messages) = watch::channel(crate::broadcast::LatestMessages::default());
+    let (latest_messages_sender, latest_messages) = watch::channel(crate::topics::broadcast::LatestMessages::default());
     tokio::spawn(broadcast(hub.clone(), clock, latest_messages_sender));
     let admission = Admission::new(Limits::of_process());
     let log = Arc::new(ClientLog::new());

@@ -1,8 +1,8 @@
 //! The keyframe list with the order of its changes, so that clients receive only what has changed.
 
-use crate::protocol::MAX_CHANGED_KEYFRAMES;
-use crate::server_message::{NumberedKeyframe, ServerMessage};
-use crate::updates::KeyframePose;
+use crate::session::protocol::MAX_CHANGED_KEYFRAMES;
+use crate::session::server_message::{NumberedKeyframe, ServerMessage};
+use crate::topics::updates::KeyframePose;
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 
@@ -167,8 +167,8 @@ fn has_changed(before: &KeyframePose, after: &KeyframePose) -> bool {
 #[cfg(test)]
 mod tests {
     use super::{Changes, KeyframeLog, ListPosition, MAX_REMOVALS};
-    use crate::protocol::MAX_CHANGED_KEYFRAMES;
-    use crate::updates::KeyframePose;
+    use crate::session::protocol::MAX_CHANGED_KEYFRAMES;
+    use crate::topics::updates::KeyframePose;
     use kinematics::random::Random;
     use kinematics::{Stamp, Transform};
     use serde_json::Value;

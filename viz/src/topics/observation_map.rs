@@ -1,7 +1,7 @@
 //! When and how precisely each part of the scene was observed, for viewers.
 
 use crate::clock::ServerClock;
-use crate::server_message::{BinaryHeader, ObservationsHeader, frame};
+use crate::session::server_message::{BinaryHeader, ObservationsHeader, frame};
 use flate2::Compression;
 use flate2::write::ZlibEncoder;
 use std::io::Write;

@@ -1,20 +1,28 @@
 //! The session of one client, from hello to goodbye: a reader and a writer that never wait for each other.
 
+pub(crate) mod link_rate;
+#[cfg(any(test, fuzzing))]
+pub(crate) mod message_checks;
+pub(crate) mod negotiation;
+pub(crate) mod protocol;
+pub(crate) mod server_message;
+mod writer;
+
 use crate::Hub;
-use crate::access::Role;
-use crate::admission::Connection;
-use crate::client_log::ClientLog;
 use crate::clock::ServerClock;
 use crate::edit::EditRequest;
 use crate::hub::{Demand, MAX_WAITING_EDITS};
-use crate::link_rate::LinkRate;
-use crate::negotiation::{Negotiated, negotiate};
-use crate::protocol::{ClientMessage, ControlMessage, ShownMessage, SubscribeMessage};
-use crate::queue::MAX_VIEWS;
-use crate::server_context::ServerContext;
-use crate::view_request::{InvalidRequest, ViewRequest};
-use crate::viewpoint::Viewpoint;
-use crate::writer::{Reply, Writer};
+use crate::pictures::queue::MAX_VIEWS;
+use crate::pictures::view_request::{InvalidRequest, ViewRequest};
+use crate::pictures::viewpoint::Viewpoint;
+use crate::server::access::Role;
+use crate::server::admission::Connection;
+use crate::server::client_log::ClientLog;
+use crate::server::server_context::ServerContext;
+use crate::session::link_rate::LinkRate;
+use crate::session::negotiation::{Negotiated, negotiate};
+use crate::session::protocol::{ClientMessage, ControlMessage, ShownMessage, SubscribeMessage};
+use crate::session::writer::{Reply, Writer};
 use axum::extract::ws::{Message, WebSocket};
 use futures_util::StreamExt;
 use futures_util::stream::SplitStream;

@@ -1,6 +1,6 @@
 //! Estimates how fast a client's connection transfers data, so that little of it waits in buffers.
 
-use crate::compact_depth::Effort;
+use crate::pictures::compact_depth::Effort;
 use std::time::Duration;
 
 /// Data handed to the kernel at once, and data in the kernel's buffer, as transfer times. Together they stay below
