@@ -1,6 +1,8 @@
 //! Serves the hub's data as topics to Foxglove, on a separate thread and port.
 
 use crate::pictures::picture::live_jpeg;
+use crate::topics::keyframes::KeyframePoses;
+use crate::topics::live_images::LiveImages;
 use crate::topics::robot::{RobotDescription, RobotState};
 use crate::topics::updates::{KeyframePose, LiveImage, Status};
 use crate::{Error, Hub};
@@ -167,7 +169,7 @@ impl CameraTopics {
 /// Publishes each new image with the calibration and pose of its camera. Never returns.
 async fn publish_images(topics: &Topics) {
     let mut cameras: BTreeMap<Arc<str>, CameraTopics> = BTreeMap::new();
-    let mut live_images = topics.hub.live_images();
+    let mut live_images = topics.hub.latest::<LiveImages>().subscribe();
     live_images.mark_changed();
     while live_images.changed().await.is_ok() {
         let images: Vec<Arc<LiveImage>> = live_images.borrow_and_update().values().cloned().collect();
@@ -207,10 +209,11 @@ async fn publish_images(topics: &Topics) {
 
 /// Publishes joint states and the poses of all links. Never returns.
 async fn publish_robot(topics: &Topics) {
-    let mut states = topics.hub.robot_state();
+    let mut states = topics.hub.latest::<Option<Arc<RobotState>>>().subscribe();
     states.mark_changed();
     while states.changed().await.is_ok() {
-        let (state, description) = (states.borrow_and_update().clone(), topics.hub.robot().borrow().clone());
+        let (state, description) =
+            (states.borrow_and_update().clone(), topics.hub.latest::<Option<Arc<RobotDescription>>>().borrow().clone());
         let (Some(state), Some(description)) = (state, description) else { continue };
         let joints = description.joint_names.iter().zip(&state.positions);
         let joint = |(name, position): (&String, &f64)| JointState {
@@ -227,7 +230,8 @@ async fn publish_robot(topics: &Topics) {
 
 /// Publishes keyframes and metrics after every change, and again from time to time. Never returns.
 async fn publish_lists(topics: &Topics) {
-    let (mut keyframes, mut status) = (topics.hub.keyframes(), topics.hub.status());
+    let mut keyframes = topics.hub.latest::<KeyframePoses>().subscribe();
+    let mut status = topics.hub.latest::<Option<Arc<Status>>>().subscribe();
     let mut repeat = tokio::time::interval(REPEAT_PERIOD);
     repeat.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
     loop {
@@ -250,9 +254,9 @@ async fn publish_lists(topics: &Topics) {
 
 /// Stamp of the newest image or robot state. Metrics have no stamp of their own.
 fn newest_stamp(hub: &Hub) -> Stamp {
-    let images = hub.live_images();
+    let images = hub.latest::<LiveImages>();
     let of_images = images.borrow().values().map(|image| image.stamp).max();
-    let of_robot = hub.robot_state().borrow().as_ref().map(|state| state.stamp);
+    let of_robot = hub.latest::<Option<Arc<RobotState>>>().borrow().as_ref().map(|state| state.stamp);
     of_images.max(of_robot).unwrap_or_default()
 }
 

@@ -10,22 +10,15 @@ use crate::pose::row_major;
 use crate::server::access::Role;
 use crate::session::protocol::{Control, ProjectionMessage};
 use crate::session::server_message::PictureHeader;
-use crate::topics::base_path::BasePath;
-use crate::topics::chunk_list::ChunkList;
-use crate::topics::observation_map::{ObservationMap, PackedObservations};
-use crate::topics::range_scan::RangeScan;
-use crate::topics::robot::{RobotDescription, RobotState};
 use crate::topics::subscriptions::Subscriptions;
-use crate::topics::updates::{KeyframePose, LiveImage, RunResult, SceneHint, Status};
-use keyframe::Keyframe;
-use kinematics::{Stamp, Transform};
 use parking_lot::{Condvar, Mutex, MutexGuard};
+use std::any::{Any, TypeId};
 use std::collections::BTreeMap;
+use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Weak};
 use std::time::{Duration, Instant};
 use tokio::sync::{Notify, watch};
-use trainer::{ModelChunks, Packing, Projection, RenderRequest, Rendered};
+use trainer::{Packing, Projection, RenderRequest, Rendered};
 
 /// Handle shared by the training thread and a [`Server`](crate::Server). Clones refer to the same hub.
 #[derive(Clone, Debug, Default)]
@@ -33,25 +26,14 @@ pub struct Hub {
     shared: Arc<Shared>,
 }
 
-/// Latest images by camera name.
-pub(crate) type LiveImages = BTreeMap<Arc<str>, Arc<LiveImage>>;
-
-/// Latest scans by scanner name.
-pub(crate) type RangeScans = BTreeMap<Arc<str>, Arc<RangeScan>>;
-
-/// Chunks of models by method.
-pub(crate) type ModelLists = BTreeMap<Arc<str>, Arc<ChunkList>>;
-
-/// Keyframes by camera and stamp.
-type KeyframeSources = BTreeMap<(Arc<str>, i64), Weak<Keyframe>>;
+/// The latest data of the topics, by type.
+type LatestData = BTreeMap<TypeId, Box<dyn Any + Send>>;
 
 /// A client gets keyframes and images this long after it has joined, or after its hello. Earlier, it is not known which
 /// of them it wants, and at which size.
 const HELLO_GRACE: Duration = Duration::from_millis(500);
 /// Maximum number of edits that wait to be applied.
 pub(crate) const MAX_WAITING_EDITS: usize = 64;
-/// Maximum time between two positions on the path of the base.
-const PATH_PERIOD: Duration = Duration::from_millis(100);
 
 /// What a client receives.
 #[derive(Clone, Debug)]
@@ -82,27 +64,10 @@ impl Demand {
 
 #[derive(Debug, Default)]
 struct Shared {
-    status: watch::Sender<Option<Arc<Status>>>,
-    scene: watch::Sender<Option<Arc<SceneHint>>>,
-    keyframes: watch::Sender<Arc<[KeyframePose]>>,
-    live_images: watch::Sender<LiveImages>,
-    /// Keyframes whose points clients can draw. The run owns them and may drop them at any time.
-    keyframe_sources: Mutex<KeyframeSources>,
-    /// Chunks of the models to which clients subscribe.
-    model_chunks: watch::Sender<ModelLists>,
-    /// Pose of the models in the world of the clients; the identity if `None`.
-    world_from_model: Mutex<Option<Transform>>,
-    robot: watch::Sender<Option<Arc<RobotDescription>>>,
-    robot_state: watch::Sender<Option<Arc<RobotState>>>,
-    base_path: watch::Sender<BasePath>,
-    /// When the path was extended last.
-    path_extended: Mutex<Option<Instant>>,
-    range_scans: watch::Sender<RangeScans>,
-    observations: watch::Sender<Option<Arc<PackedObservations>>>,
+    /// A [`watch::Sender`] of each type that [`Hub::latest`] was called with.
+    latest: Mutex<LatestData>,
     /// Requirements of the connected clients.
     demands: Mutex<BTreeMap<u64, Demand>>,
-    /// For each camera: transform `reported_from_corrected`.
-    camera_corrections: Mutex<BTreeMap<Arc<str>, Transform>>,
     /// Actions that the run has not taken yet, without repetitions.
     controls: Mutex<Vec<Control>>,
     shown_pictures: Mutex<ShownPictures>,
@@ -120,117 +85,29 @@ impl Hub {
         Self::default()
     }
 
-    /// Sets the run status that clients receive.
-    pub fn set_status(&self, status: Status) {
-        self.shared.status.send_replace(Some(Arc::new(status.thinned())));
+    /// The latest data of this type. Each topic has types of its own, and sets and reads them in its module.
+    pub(crate) fn latest<T: Default + Send + Sync + 'static>(&self) -> watch::Sender<T> {
+        let mut latest = self.shared.latest.lock();
+        let sender = latest.entry(TypeId::of::<T>()).or_insert_with(|| Box::new(watch::Sender::<T>::default()));
+        sender.downcast_ref::<watch::Sender<T>>().expect("the key is its type").clone()
     }
 
-    /// Replaces the state in the latest status and keeps its numbers, for example while the model is saved.
-    pub fn set_state(&self, state: &str) {
-        self.change_status(|status| state.clone_into(&mut status.state));
+    /// Whether a client receives a topic.
+    pub(crate) fn is_wanted(&self, topic: &str) -> bool {
+        self.has_subscription(|subscriptions| subscriptions.period(topic).is_some())
     }
 
-    /// Sets the result of the run. Clients continue to show it after the server has stopped.
-    pub fn set_run_result(&self, result: RunResult) {
-        self.change_status(|status| {
-            "finished".clone_into(&mut status.state);
-            status.result = Some(result);
-        });
+    /// Whether the subscriptions of any client fulfill a condition.
+    pub(crate) fn has_subscription(&self, condition: impl Fn(&Subscriptions) -> bool) -> bool {
+        self.shared.demands.lock().values().any(|demand| condition(&demand.subscriptions))
     }
 
-    /// Changes the latest status.
-    pub fn change_status(&self, change: impl FnOnce(&mut Status)) {
-        self.shared.status.send_modify(|latest| {
-            let mut status = latest.as_deref().cloned().unwrap_or_default();
-            change(&mut status);
-            *latest = Some(Arc::new(status));
-        });
-    }
-
-    /// Sets the latest image of a camera. It is encoded later, on another thread, and only while clients are
-    /// connected. Its pose is corrected as set by [`Self::set_camera_corrections`].
-    pub fn set_live_image(&self, mut image: LiveImage) {
-        if let (Some(pose), Some(correction)) =
-            (&mut image.world_from_camera, self.shared.camera_corrections.lock().get(&image.camera))
-        {
-            *pose *= correction;
-        }
-        self.shared.live_images.send_modify(|images| {
-            images.insert(Arc::clone(&image.camera), Arc::new(image));
-        });
-    }
-
-    /// Sets `reported_from_corrected` of each camera, with which the poses of later live images are corrected.
-    pub fn set_camera_corrections(&self, corrections: BTreeMap<Arc<str>, Transform>) {
-        *self.shared.camera_corrections.lock() = corrections;
-    }
-
-    /// Sets the scene extent and the initial view.
-    pub fn set_scene_hint(&self, hint: SceneHint) {
-        self.shared.scene.send_replace(Some(Arc::new(hint)));
-    }
-
-    /// Replaces the keyframe frustums. Call this when the keyframes have changed.
-    pub fn set_keyframes(&self, keyframes: Vec<KeyframePose>) {
-        self.shared.keyframes.send_replace(keyframes.into());
-    }
-
-    /// The keyframe frustums.
-    pub fn keyframe_poses(&self) -> Vec<KeyframePose> {
-        self.shared.keyframes.borrow().to_vec()
-    }
-
-    /// The minimum time between two calls of [`Self::set_model_chunks`] for a model; `None` if no client draws it.
-    pub fn chunk_period(&self, method: &str) -> Option<Duration> {
-        let demands = self.shared.demands.lock();
-        let subscriptions = demands.values().filter_map(|demand| demand.subscriptions.model_chunks.as_ref());
-        subscriptions.filter(|chunks| &*chunks.method == method).map(|chunks| chunks.period).min()
-    }
-
-    /// Whether clients have the chunks of this model, so that only changed chunks are needed.
-    pub fn has_model_chunks(&self, method: &str) -> bool {
-        self.shared.model_chunks.borrow().contains_key(method)
-    }
-
-    /// Sets the chunks of a model, or those that have changed. They are kept only while a client draws the model.
-    pub fn set_model_chunks(&self, method: &str, chunks: ModelChunks) {
-        if self.chunk_period(method).is_none() {
-            return;
-        }
-        self.shared.model_chunks.send_modify(|lists| {
-            let mut list = lists.get(method).map(|list| (**list).clone()).unwrap_or_default();
-            list.world_from_model = self.shared.world_from_model.lock().unwrap_or_default();
-            if list.apply(chunks) {
-                lists.insert(method.into(), Arc::new(list));
-            }
-        });
-    }
-
-    /// Sets the pose of models in the world of the clients, for chunks; by default, the two frames are the same.
-    pub fn set_world_from_model(&self, world_from_model: Transform) {
-        *self.shared.world_from_model.lock() = Some(world_from_model);
-    }
-
-    /// Frees the chunks of models that no client draws any longer.
-    fn drop_unused_chunks(&self) {
-        let unused = |method: &str| self.chunk_period(method).is_none();
-        self.shared.model_chunks.send_if_modified(|lists| {
-            let n_before = lists.len();
-            lists.retain(|method, _| !unused(method));
-            lists.len() < n_before
-        });
-    }
-
-    /// Sets the robot that clients draw.
-    pub fn set_robot(&self, robot: RobotDescription) {
-        self.shared.robot.send_replace(Some(Arc::new(robot)));
-    }
-
-    /// Sets the current state of the robot.
-    pub fn set_robot_state(&self, state: RobotState) {
-        *self.shared.path_extended.lock() = Some(Instant::now());
-        self.shared.base_path.send_if_modified(|path| path.push(state.world_from_base.translation.vector.into()));
-        self.shared.robot_state.send_replace(Some(Arc::new(state)));
+    /// The minimum period over the subscriptions of all clients; `None` if no client has one.
+    pub(crate) fn min_over_subscriptions(
+        &self,
+        period: impl Fn(&Subscriptions) -> Option<Duration>,
+    ) -> Option<Duration> {
+        self.shared.demands.lock().values().filter_map(|demand| period(&demand.subscriptions)).min()
     }
 
     /// Sets whether somebody besides the clients needs images and robot states.
@@ -239,54 +116,8 @@ impl Hub {
         self.shared.is_observed.store(is_observed, Ordering::Relaxed);
     }
 
-    fn is_observed(&self) -> bool {
+    pub(crate) fn is_observed(&self) -> bool {
         self.shared.is_observed.load(Ordering::Relaxed)
-    }
-
-    /// Whether a client shows the images of any camera.
-    pub fn needs_live_images(&self) -> bool {
-        self.is_observed() || self.shared.demands.lock().values().any(|demand| demand.subscriptions.has_live_images())
-    }
-
-    /// Whether a client draws the robot, or the path of its base is due.
-    pub fn needs_robot_state(&self) -> bool {
-        let is_path_due = self.shared.path_extended.lock().is_none_or(|at| at.elapsed() >= PATH_PERIOD);
-        self.is_observed()
-            || is_path_due
-            || self.shared.demands.lock().values().any(|demand| demand.subscriptions.robot_state.is_some())
-    }
-
-    /// Sets the latest scan of a range scanner. It is encoded later, on another thread, and only for clients that show
-    /// it.
-    pub fn set_range_scan(&self, range_scan: RangeScan) {
-        self.shared.range_scans.send_modify(|scans| {
-            scans.insert(Arc::clone(&range_scan.scan.scanner), Arc::new(range_scan));
-        });
-    }
-
-    /// Whether a client shows when and how precisely the scene was observed.
-    pub fn needs_observations(&self) -> bool {
-        self.shared.demands.lock().values().any(|demand| demand.subscriptions.observations.is_some())
-    }
-
-    /// Sets the map of observations. Compresses it, which takes some milliseconds.
-    pub fn set_observations(&self, map: &ObservationMap) {
-        match PackedObservations::new(map) {
-            Ok(packed) => _ = self.shared.observations.send_replace(Some(Arc::new(packed))),
-            Err(error) => log::error!("cannot compress the map of observations: {error}"),
-        }
-    }
-
-    /// Sets the keyframes of which clients can draw points. They are not kept alive.
-    pub fn set_keyframe_sources<'a>(&self, keyframes: impl IntoIterator<Item = &'a Arc<Keyframe>>) {
-        let key = |keyframe: &Keyframe| (Arc::clone(&keyframe.camera), keyframe.stamp.0);
-        let sources = keyframes.into_iter().map(|keyframe| (key(keyframe), Arc::downgrade(keyframe))).collect();
-        *self.shared.keyframe_sources.lock() = sources;
-    }
-
-    /// The keyframe with this camera and stamp, if the run still has it.
-    pub(crate) fn keyframe_source(&self, camera: &Arc<str>, stamp: Stamp) -> Option<Arc<Keyframe>> {
-        self.shared.keyframe_sources.lock().get(&(Arc::clone(camera), stamp.0))?.upgrade()
     }
 
     /// The actions that operators have requested since the last call, in order.
@@ -409,46 +240,6 @@ impl Hub {
     pub(crate) fn release(&self, client: u64) {
         self.queue().release(client);
         self.shared.work_arrived.notify_all();
-    }
-
-    pub(crate) fn status(&self) -> watch::Receiver<Option<Arc<Status>>> {
-        self.shared.status.subscribe()
-    }
-
-    pub(crate) fn scene(&self) -> watch::Receiver<Option<Arc<SceneHint>>> {
-        self.shared.scene.subscribe()
-    }
-
-    pub(crate) fn keyframes(&self) -> watch::Receiver<Arc<[KeyframePose]>> {
-        self.shared.keyframes.subscribe()
-    }
-
-    pub(crate) fn robot(&self) -> watch::Receiver<Option<Arc<RobotDescription>>> {
-        self.shared.robot.subscribe()
-    }
-
-    pub(crate) fn robot_state(&self) -> watch::Receiver<Option<Arc<RobotState>>> {
-        self.shared.robot_state.subscribe()
-    }
-
-    pub(crate) fn base_path(&self) -> watch::Receiver<BasePath> {
-        self.shared.base_path.subscribe()
-    }
-
-    pub(crate) fn range_scans(&self) -> watch::Receiver<RangeScans> {
-        self.shared.range_scans.subscribe()
-    }
-
-    pub(crate) fn observations(&self) -> watch::Receiver<Option<Arc<PackedObservations>>> {
-        self.shared.observations.subscribe()
-    }
-
-    pub(crate) fn model_chunks(&self) -> watch::Receiver<ModelLists> {
-        self.shared.model_chunks.subscribe()
-    }
-
-    pub(crate) fn live_images(&self) -> watch::Receiver<LiveImages> {
-        self.shared.live_images.subscribe()
     }
 
     /// Locks the queue. It holds plain values that are valid after every statement, so it stays usable after a panic

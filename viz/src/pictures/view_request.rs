@@ -58,6 +58,8 @@ pub(crate) enum InvalidRequest {
     Views { max: usize },
     #[error("shown_millis is {got}, expected a time on the server's clock, 0 or more")]
     ShownTime { got: f64 },
+    #[error("topic is {got:?}, expected one of {}", quoted(known))]
+    Topic { got: String, known: Vec<&'static str> },
     #[error("rate_hz is {got}, expected 0 to {max}", max = crate::session::protocol::MAX_RATE_HZ)]
     Rate { got: f64 },
     #[error("camera and size_px apply only to the topic live_images")]
@@ -72,6 +74,11 @@ pub(crate) enum InvalidRequest {
     ImageSize { got: [u32; 2], min: u32 },
     #[error("at most {max} cameras can have a subscription of their own, with names of at most {max_bytes} bytes")]
     Cameras { max: usize, max_bytes: usize },
+}
+
+fn quoted(names: &[&str]) -> String {
+    let quoted: Vec<_> = names.iter().map(|name| format!("{name:?}")).collect();
+    quoted.join(", ")
 }
 
 /// A validated render message.

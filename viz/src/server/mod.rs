@@ -16,7 +16,8 @@ use crate::server::client_log::ClientLog;
 use crate::server::page::{FILES, has_version};
 use crate::server::server_context::ServerContext;
 use crate::session::protocol::MAX_MESSAGE_BYTES;
-use crate::topics::broadcast::broadcast;
+use crate::topics::robot::RobotDescription;
+use crate::topics::{self, Publisher};
 use crate::{Error, Hub, Status, session};
 use axum::extract::{Extension, Path, Request, State, WebSocketUpgrade};
 use axum::http::{HeaderMap, HeaderName, HeaderValue, StatusCode, header};
@@ -170,11 +171,11 @@ async fn serve(
     set_socket_options(&listener);
     let listener = tokio::net::TcpListener::from_std(listener)?;
     let clock = ServerClock::start();
-    let (latest_messages_sender, latest_messages) = watch::channel(crate::topics::broadcast::LatestMessages::default());
-    tokio::spawn(broadcast(hub.clone(), clock, latest_messages_sender));
+    let (topics, publisher) = (topics::start_all(&hub), Publisher::default());
+    tokio::spawn(topics::encode_all(hub.clone(), clock, Arc::clone(&topics), publisher.clone()));
     let admission = Admission::new(Limits::of_process());
     let log = Arc::new(ClientLog::new());
-    let server_context = ServerContext { hub: hub.clone(), clock, latest_messages, log, stopped: stopped.clone() };
+    let server_context = ServerContext { hub: hub.clone(), clock, topics, publisher, log, stopped: stopped.clone() };
     let app = TowerToHyperService::new(router(AppState {
         server_context,
         admission: Arc::clone(&admission),
@@ -311,7 +312,7 @@ fn router(app_state: AppState) -> Router {
 }
 
 async fn status(State(app_state): State<AppState>) -> Response {
-    let latest = app_state.server_context.hub.status().borrow().clone();
+    let latest = app_state.server_context.hub.status();
     let json = match latest {
         Some(status) => serde_json::to_string(&*status),
         None => serde_json::to_string(&Status::default()),
@@ -328,7 +329,7 @@ async fn status(State(app_state): State<AppState>) -> Response {
 /// A mesh file of the robot, or 304 if the client has this version. Names are numbers in a list, so that no other file
 /// can be requested.
 async fn robot_mesh(Path(name): Path<String>, State(app_state): State<AppState>, request: HeaderMap) -> Response {
-    let robot = app_state.server_context.hub.robot().borrow().clone();
+    let robot = app_state.server_context.hub.latest::<Option<Arc<RobotDescription>>>().borrow().clone();
     let mesh = robot.as_deref().and_then(|robot| robot.mesh_at(&name));
     let Some((format, bytes)) = mesh.map(|mesh| (mesh.format, Arc::clone(&mesh.bytes))) else {
         return (StatusCode::NOT_FOUND, "the robot has no mesh with this name").into_response();

@@ -3,7 +3,7 @@
 use crate::Hub;
 use crate::clock::ServerClock;
 use crate::server::client_log::ClientLog;
-use crate::topics::broadcast::LatestMessages;
+use crate::topics::{Publisher, Topic};
 use std::sync::Arc;
 use tokio::sync::watch;
 
@@ -14,8 +14,10 @@ pub(crate) struct ServerContext {
     pub(crate) hub: Hub,
     /// The server's clock.
     pub(crate) clock: ServerClock,
-    /// The latest encoded messages.
-    pub(crate) latest_messages: watch::Receiver<LatestMessages>,
+    /// What clients receive besides pictures.
+    pub(crate) topics: Arc<[Arc<dyn Topic>]>,
+    /// Notices new messages of the topics.
+    pub(crate) publisher: Publisher,
     /// Log of client activity.
     pub(crate) log: Arc<ClientLog>,
     /// Becomes true when the server stops.

@@ -9,6 +9,7 @@ use crate::session::protocol::{
     BASE_PROTOCOL_VERSION, ClientHello, ClientMessage, EditMessage, MAX_RATE_HZ, PROTOCOL_VERSION, RenderMessage,
     ShownMessage, SubscribeMessage,
 };
+use crate::topics::TOPICS;
 use crate::topics::subscriptions::{Subscriptions, fitted};
 use trainer::{Aabb, Projection, RenderRequest};
 
@@ -75,13 +76,11 @@ fn check_subscription(subscriptions: &mut Subscriptions, message: SubscribeMessa
         return;
     }
     let images = subscriptions.images_of(&camera);
-    let Subscriptions { status, keyframes, robot_state, keyframe_points, range_scans, base_path, .. } = *subscriptions;
     let chunks = subscriptions.model_chunks.as_ref();
-    let chunk_period = chunks.map(|chunks| chunks.period);
-    let periods =
-        [status, keyframes, robot_state, keyframe_points, range_scans, base_path, images.period, chunk_period];
+    let of_topics = TOPICS.iter().filter_map(|row| subscriptions.period(row.name));
+    let periods = of_topics.chain(images.period).chain(chunks.map(|chunks| chunks.period));
     assert!(chunks.is_none_or(|chunks| chunks.method.len() <= 256 && chunks.max_bytes_per_sec >= 1e4));
-    assert!(periods.into_iter().flatten().all(|period| period.as_secs_f64() >= 0.999 / MAX_RATE_HZ));
+    assert!(periods.into_iter().all(|period| period.as_secs_f64() >= 0.999 / MAX_RATE_HZ));
     for size_px in [[640, 480], [1, 4000], [4096, 1]] {
         let fitted = fitted(size_px, images.max_px);
         assert!((0..2).all(|axis| (1..=size_px[axis]).contains(&fitted[axis])), "{size_px:?} became {fitted:?}");

@@ -68,36 +68,12 @@ pub(crate) struct ClientHello {
     pub(crate) capabilities: Vec<String>,
 }
 
-/// Kinds of data that clients can subscribe to.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize, Serialize)]
-#[serde(rename_all = "snake_case")]
-pub(crate) enum Topic {
-    /// Status of the run.
-    Status,
-    /// Poses of the keyframes.
-    Keyframes,
-    /// Images of the cameras.
-    LiveImages,
-    /// Robot description and joint positions.
-    RobotState,
-    /// Points of each keyframe.
-    KeyframePoints,
-    /// Scans of range scanners.
-    RangeScans,
-    /// The path of a moving base.
-    BasePath,
-    /// Chunks of a model, for clients that draw it themselves.
-    ModelChunks,
-    /// When and how precisely each part of the scene was observed.
-    Observations,
-}
-
 /// Fields of `subscribe`.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct SubscribeMessage {
-    /// What to send.
-    pub(crate) topic: Topic,
+    /// Name of the topic.
+    pub(crate) topic: String,
     /// Maximum rate; 0 ends the subscription.
     pub(crate) rate_hz: f64,
     /// Only images of this camera; of all cameras without a subscription of their own if absent.

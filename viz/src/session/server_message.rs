@@ -6,6 +6,7 @@ use crate::server::access::Role;
 use crate::session::protocol::{DepthFormat, ProjectionMessage};
 use crate::topics::robot::{RobotMessage, RobotStateMessage};
 use crate::topics::updates::{KeyframePose, LiveImage, SceneHint, Status};
+use axum::extract::ws::Message;
 use serde::Serialize;
 use trainer::ChunkLayout;
 
@@ -266,6 +267,11 @@ impl<'a> LiveHeader<'a> {
 }
 
 impl ServerMessage<'_> {
+    /// The message.
+    pub(crate) fn to_message(&self) -> Message {
+        Message::text(self.to_json())
+    }
+
     /// The message as JSON.
     pub(crate) fn to_json(&self) -> String {
         serde_json::to_string(self).expect("these types hold only strings, numbers and maps with string keys")

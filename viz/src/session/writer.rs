@@ -18,7 +18,8 @@ use crate::session::negotiation::{Agreement, CAPABILITIES, Negotiated};
 use crate::session::protocol::{BASE_PROTOCOL_VERSION, PROTOCOL_VERSION};
 use crate::session::server_message::{BinaryHeader, PartHeader, ServerMessage, frame};
 use crate::topics::client_updates::{ClientUpdates, Next};
-use crate::topics::robot::RobotStateMessage;
+use crate::topics::items::ItemTopic;
+use crate::topics::robot::{Description, RobotState, RobotStateMessage};
 use axum::body::Bytes;
 use axum::extract::ws::{Message, WebSocket};
 use futures_util::SinkExt;
@@ -93,11 +94,11 @@ impl Writer<'_> {
         mut demand: watch::Receiver<Demand>,
     ) -> SessionFlow {
         let mut stopped = self.server_context.stopped.clone();
-        let mut latest_messages = self.server_context.latest_messages.clone();
-        let mut robot_state = self.server_context.hub.robot_state();
+        let mut published = self.server_context.publisher.changed();
+        let mut robot_state = self.server_context.hub.latest::<Option<Arc<RobotState>>>().subscribe();
         robot_state.mark_changed();
         let mut robot_state_sent: Option<Instant> = None;
-        let mut updates = ClientUpdates::default();
+        let mut updates = ClientUpdates::new(&self.server_context.topics);
         let mut long_update_sent = Instant::now();
         let mut waiting_update: Option<(Message, bool)> = None;
         let mut encoding: Option<EncodingTask> = None;
@@ -145,9 +146,9 @@ impl Writer<'_> {
                 && transfer.is_none()
                 && (encoding.is_none() || long_update_sent.elapsed() > MAX_UPDATE_DELAY);
             if waiting_update.is_none() {
-                let latest = latest_messages.borrow_and_update();
+                published.mark_unchanged();
                 let has_changes = self.negotiated.has_keyframe_changes;
-                match updates.next(&latest, &subscriptions, has_changes, Instant::now(), allows_long) {
+                match updates.next(&subscriptions, has_changes, Instant::now(), allows_long) {
                     Next::Short(message) => waiting_update = Some((message, false)),
                     Next::Long(message) => waiting_update = Some((message, true)),
                     Next::WaitUntil(time) => update_due = Some(update_due.map_or(time, |due| due.min(time))),
@@ -156,16 +157,16 @@ impl Writer<'_> {
             }
             let is_waiting_long = waiting_update.as_ref().map(|(_, is_long)| *is_long);
             // A waiting short message may be the robot, which comes before its states.
-            let state_due = subscriptions
-                .robot_state
-                .filter(|_| is_heard && updates.has_robot() && is_waiting_long != Some(false))
+            let state_period = subscriptions.period(Description::NAME);
+            let state_due = state_period
+                .filter(|_| is_heard && updates.has_sent(Description::NAME) && is_waiting_long != Some(false))
                 .map(|period| robot_state_sent.and_then(|sent| sent.checked_add(period)).unwrap_or_else(Instant::now));
             tokio::select! {
                 biased;
                 _ = stopped.changed() => return self.send_goodbye_when_stopped().await,
                 Some(reply) = replies.recv() => self.reply(reply).await?,
                 () = changed_after(&mut robot_state, state_due) => {
-                    robot_state_sent = state_due.zip(subscriptions.robot_state).map(on_schedule);
+                    robot_state_sent = state_due.zip(state_period).map(on_schedule);
                     let state = robot_state.borrow_and_update().clone();
                     if let Some(state) = state {
                         let message = RobotStateMessage::new(&state, self.server_context.clock);
@@ -218,7 +219,7 @@ impl Writer<'_> {
                     sent?;
                 }
                 () = wake.notified(), if encoding.is_none() => {}
-                _ = latest_messages.changed(), if waiting_update.is_none() => {}
+                _ = published.changed(), if waiting_update.is_none() => {}
                 _ = demand.changed() => {}
                 () = sleep_until(update_due) => {}
             }
@@ -293,7 +294,7 @@ impl Writer<'_> {
 
     /// Sends the last status, which contains the result of the run, then a goodbye.
     async fn send_goodbye_when_stopped(&mut self) -> SessionFlow {
-        let latest = self.server_context.hub.status().borrow().clone();
+        let latest = self.server_context.hub.status();
         if let Some(status) = latest {
             self.send_message(&ServerMessage::Status(&status)).await?;
         }
@@ -312,7 +313,7 @@ impl Writer<'_> {
     }
 
     async fn send_message(&mut self, message: &ServerMessage<'_>) -> SessionFlow {
-        self.send(Message::text(message.to_json())).await
+        self.send(message.to_message()).await
     }
 
     async fn send(&mut self, message: Message) -> SessionFlow {

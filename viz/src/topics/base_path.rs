@@ -1,28 +1,56 @@
 //! The path of a moving base, for viewers.
 
+use crate::clock::ServerClock;
+use crate::session::server_message::ServerMessage;
+use crate::topics::items::ItemTopic;
+use crate::topics::{DefaultRate, Priority};
+use axum::extract::ws::Message;
 use nalgebra::Vector3;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
 
 /// Maximum number of points; beyond it, every second point is removed.
 const MAX_POINTS: usize = 512;
 /// Minimum distance of two points at first, meters.
 const INITIAL_SPACING_M: f64 = 0.02;
+/// Maximum time between two positions on the path.
+const POSITION_PERIOD: Duration = Duration::from_millis(100);
+
+/// The topic.
+#[derive(Default)]
+pub(crate) struct BasePathTopic;
+
+impl ItemTopic for BasePathTopic {
+    const NAME: &'static str = "base_path";
+    const DEFAULT: DefaultRate = DefaultRate::Off;
+    const PRIORITY: Priority = Priority::Short;
+    const PERIOD: Duration = Duration::from_millis(500);
+    type Source = BasePath;
+
+    fn encode(&mut self, path: &BasePath, _: ServerClock) -> Vec<(Arc<str>, Message)> {
+        vec![("".into(), ServerMessage::BasePath { points_m: path.rounded() }.to_message())]
+    }
+}
 
 /// Positions of the base so far, in world.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct BasePath {
     points_m: Vec<[f64; 3]>,
     spacing_m: f64,
+    /// When a position was added or left out last.
+    extended: Option<Instant>,
 }
 
 impl Default for BasePath {
     fn default() -> Self {
-        Self { points_m: Vec::new(), spacing_m: INITIAL_SPACING_M }
+        Self { points_m: Vec::new(), spacing_m: INITIAL_SPACING_M, extended: None }
     }
 }
 
 impl BasePath {
     /// Adds a position unless it is too close to the last one. Returns whether it was added.
     pub(crate) fn push(&mut self, position_m: [f64; 3]) -> bool {
+        self.extended = Some(Instant::now());
         let distance = |last: &[f64; 3]| (Vector3::from(*last) - Vector3::from(position_m)).norm();
         if self.points_m.last().is_some_and(|last| distance(last) < self.spacing_m) {
             return false;
@@ -37,6 +65,11 @@ impl BasePath {
         }
         self.points_m.push(position_m);
         true
+    }
+
+    /// Whether the next position is due.
+    pub(crate) fn is_due(&self) -> bool {
+        self.extended.is_none_or(|at| at.elapsed() >= POSITION_PERIOD)
     }
 
     /// The path, rounded to millimeters, which shortens the message.

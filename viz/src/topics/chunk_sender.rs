@@ -72,7 +72,7 @@ impl ChunkSender {
             self.sent = kept;
             let ids = removed.into_keys().collect();
             let message = ServerMessage::ModelChunksRemoved { method: &subscription.method, ids };
-            return NextChunk::Send(Message::text(message.to_json()));
+            return NextChunk::Send(message.to_message());
         }
         let is_coarse = |chunk: &&Arc<VersionedChunk>| self.sent.get(&chunk.chunk.id).is_some_and(|sent| !sent.is_fine);
         if let Some(chunk) = first_needed(list, viewpoint, is_coarse) {

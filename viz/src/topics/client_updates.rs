@@ -1,60 +1,28 @@
-//! Decides which update a client receives next, according to its subscriptions.
+//! Decides which message of a topic a client receives next.
 
 use crate::pictures::viewpoint::Viewpoint;
-use crate::topics::broadcast::{Item, LatestMessages};
-use crate::topics::chunk_sender::{ChunkSender, NextChunk};
-use crate::topics::keyframe_log::{Changes, ListPosition};
 use crate::topics::subscriptions::Subscriptions;
+use crate::topics::{ClientState, Feed, KeyframeProgress, Priority, TOPICS, Timer, Topic};
 use axum::extract::ws::Message;
-use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
-/// What a client has received.
-#[derive(Debug, Default)]
+/// The feeds of a client.
 pub(crate) struct ClientUpdates {
-    scene: u64,
-    robot: u64,
-    status: Sent,
-    keyframe_list: Sent,
-    keyframe_changes: ListPosition,
-    /// When the client's list was last up to date.
-    keyframe_changes_at: Option<Instant>,
-    /// Number of the subscription to keyframes that the list belongs to.
-    n_keyframe_lists: u64,
-    live_images: BTreeMap<Arc<str>, Sent>,
-    base_path: Sent,
-    range_scans: BTreeMap<Arc<str>, Sent>,
-    observations: Sent,
-    /// Whether the last long message was a live image.
-    was_image: bool,
-    /// Numbers of the keyframes whose points were sent, and the time of the last ones.
-    keyframe_points: BTreeSet<u64>,
-    keyframe_points_at: Option<Instant>,
-    /// Number of the subscription to points that these points belong to.
-    n_point_subscriptions: u64,
-    model_chunks: ChunkSender,
+    /// In the order of the table.
+    feeds: Vec<NamedFeed>,
+    keyframes: KeyframeProgress,
+    /// Whether the last message about live data or keyframes was about live data.
+    was_live: bool,
     /// Viewpoint of the client's newest picture.
     pub(crate) viewpoint: Option<Viewpoint>,
 }
 
-/// Number of the last item of a kind, and when it was sent.
-#[derive(Clone, Copy, Debug, Default)]
-struct Sent {
-    number: u64,
-    at: Option<Instant>,
-}
-
-impl Sent {
-    /// The message of a newer item if the client has subscribed to this kind and its period is over.
-    fn next(&mut self, (period, latest): (Option<Duration>, &Option<Item>), timer: &mut Timer) -> Option<Message> {
-        let item = latest.as_ref().filter(|item| item.number > self.number)?;
-        if !timer.is_due(self.at, period?) {
-            return None;
-        }
-        *self = Self { number: item.number, at: Some(timer.now) };
-        Some(item.message.clone())
-    }
+/// A feed with what the table says about its topic.
+pub(crate) struct NamedFeed {
+    pub(crate) name: &'static str,
+    pub(crate) priority: Priority,
+    pub(crate) feed: Box<dyn Feed>,
 }
 
 /// What to do next.
@@ -70,233 +38,84 @@ pub(crate) enum Next {
     Wait,
 }
 
-/// Decides which items are due, and remembers when the next one is.
-struct Timer {
-    now: Instant,
-    earliest: Option<Instant>,
-}
-
-impl Timer {
-    /// Whether an item may be sent after this period since the last one.
-    fn is_due(&mut self, last: Option<Instant>, period: Duration) -> bool {
-        let due = last.and_then(|at| at.checked_add(period)).unwrap_or(self.now);
-        if due > self.now {
-            self.wait_until(due);
-        }
-        due <= self.now
-    }
-
-    /// Records that an item is due at this time.
-    fn wait_until(&mut self, due: Instant) {
-        self.earliest = Some(self.earliest.map_or(due, |earliest| earliest.min(due)));
-    }
-}
-
 impl ClientUpdates {
+    /// The feeds of a client that has received nothing.
+    pub(crate) fn new(topics: &[Arc<dyn Topic>]) -> Self {
+        let feeds = TOPICS.iter().zip(topics).map(|(row, topic)| NamedFeed {
+            name: row.name,
+            priority: row.priority,
+            feed: Arc::clone(topic).feed(),
+        });
+        Self::of_feeds(feeds.collect())
+    }
+
+    fn of_feeds(feeds: Vec<NamedFeed>) -> Self {
+        Self { feeds, keyframes: KeyframeProgress::default(), was_live: false, viewpoint: None }
+    }
+
     /// The next message, which counts as sent. Short messages come first; long ones follow only if `allows_long` is set.
     pub(crate) fn next(
         &mut self,
-        latest: &LatestMessages,
         subscriptions: &Subscriptions,
         has_keyframe_changes: bool,
         now: Instant,
         allows_long: bool,
     ) -> Next {
-        let mut timer = Timer { now, earliest: None };
-        if let Some(message) = self.next_short(latest, subscriptions, &mut timer) {
+        let mut timer = Timer::new(now);
+        let mut next_of = |updates: &mut Self, priority| {
+            let mut client = ClientState {
+                subscriptions,
+                has_keyframe_changes,
+                viewpoint: updates.viewpoint.as_ref(),
+                keyframes: &mut updates.keyframes,
+            };
+            let mut feeds = updates.feeds.iter_mut().filter(|named| named.priority == priority);
+            feeds.find_map(|named| named.feed.next(&mut client, &mut timer))
+        };
+        if let Some(message) = next_of(self, Priority::Short) {
             return Next::Short(message);
         }
-        self.restart(subscriptions);
         if allows_long {
-            // Images and keyframes alternate, so that neither delays the other for long.
-            for is_image in [!self.was_image, self.was_image] {
-                let message = if is_image {
-                    self.next_image(latest, subscriptions, &mut timer)
-                        .or_else(|| self.next_scan(latest, subscriptions, &mut timer))
-                } else if has_keyframe_changes {
-                    self.next_changes(latest, subscriptions, &mut timer)
-                        .or_else(|| self.next_points(latest, subscriptions, &mut timer))
-                } else {
-                    self.next_list(latest, subscriptions, &mut timer)
-                };
-                if let Some(message) = message {
-                    self.was_image = is_image;
+            let in_turn = if self.was_live {
+                [Priority::Keyframes, Priority::Live]
+            } else {
+                [Priority::Live, Priority::Keyframes]
+            };
+            for priority in in_turn {
+                if let Some(message) = next_of(self, priority) {
+                    self.was_live = priority == Priority::Live;
                     return Next::Long(message);
                 }
             }
-            let observations = (subscriptions.observations, &latest.observations);
-            if let Some(message) = self.observations.next(observations, &mut timer) {
-                return Next::Long(message);
-            }
-            if let Some(message) = self.next_chunk(latest, subscriptions, &mut timer) {
+            if let Some(message) = next_of(self, Priority::Background) {
                 return Next::Long(message);
             }
         }
-        timer.earliest.map_or(Next::Wait, Next::WaitUntil)
+        timer.earliest().map_or(Next::Wait, Next::WaitUntil)
     }
 
-    /// Whether the robot was sent. States without it cannot be drawn.
-    pub(crate) fn has_robot(&self) -> bool {
-        self.robot > 0
+    /// Whether the client has received anything of a topic.
+    pub(crate) fn has_sent(&self, topic: &str) -> bool {
+        self.feeds.iter().any(|named| named.name == topic && named.feed.has_sent())
     }
-
-    fn next_short(
-        &mut self,
-        latest: &LatestMessages,
-        subscriptions: &Subscriptions,
-        timer: &mut Timer,
-    ) -> Option<Message> {
-        if let Some(scene) = newer(latest.scene.as_ref(), &mut self.scene) {
-            return Some(scene);
-        }
-        if let Some(status) = self.status.next((subscriptions.status, &latest.status), timer) {
-            return Some(status);
-        }
-        if let Some(path) = self.base_path.next((subscriptions.base_path, &latest.base_path), timer) {
-            return Some(path);
-        }
-        subscriptions.robot_state.and_then(|_| newer(latest.robot.as_ref(), &mut self.robot))
-    }
-
-    /// Forgets what was sent for earlier subscriptions: new ones begin with the complete list, and with all points.
-    fn restart(&mut self, subscriptions: &Subscriptions) {
-        if subscriptions.n_keyframe_lists > self.n_keyframe_lists {
-            self.n_keyframe_lists = subscriptions.n_keyframe_lists;
-            self.keyframe_list = Sent::default();
-            (self.keyframe_changes, self.keyframe_changes_at) = (ListPosition::default(), None);
-        }
-        if subscriptions.n_point_subscriptions > self.n_point_subscriptions {
-            self.n_point_subscriptions = subscriptions.n_point_subscriptions;
-            self.keyframe_points.clear();
-        }
-    }
-
-    /// The image of the camera whose last image was sent longest ago.
-    fn next_image(
-        &mut self,
-        latest: &LatestMessages,
-        subscriptions: &Subscriptions,
-        timer: &mut Timer,
-    ) -> Option<Message> {
-        let waiting = latest.live_images.iter().filter_map(|((camera, max_px), item)| {
-            let subscription = subscriptions.images_of(camera);
-            let sent = self.live_images.get(camera).copied().unwrap_or_default();
-            let is_wanted = *max_px == subscription.max_px && item.number > sent.number;
-            let is_next = is_wanted && timer.is_due(sent.at, subscription.period?);
-            is_next.then_some((sent.number, camera, item))
-        });
-        let (_, camera, item) = waiting.min_by_key(|(number, ..)| *number)?;
-        self.live_images.insert(Arc::clone(camera), Sent { number: item.number, at: Some(timer.now) });
-        Some(item.message.clone())
-    }
-
-    /// The scan of the scanner whose last scan was sent longest ago.
-    fn next_scan(
-        &mut self,
-        latest: &LatestMessages,
-        subscriptions: &Subscriptions,
-        timer: &mut Timer,
-    ) -> Option<Message> {
-        let period = subscriptions.range_scans?;
-        let waiting = latest.range_scans.iter().filter_map(|(scanner, item)| {
-            let sent = self.range_scans.get(scanner).copied().unwrap_or_default();
-            (item.number > sent.number && timer.is_due(sent.at, period)).then_some((sent.number, scanner, item))
-        });
-        let (_, scanner, item) = waiting.min_by_key(|(number, ..)| *number)?;
-        self.range_scans.insert(Arc::clone(scanner), Sent { number: item.number, at: Some(timer.now) });
-        Some(item.message.clone())
-    }
-
-    /// The complete list of keyframes.
-    fn next_list(
-        &mut self,
-        latest: &LatestMessages,
-        subscriptions: &Subscriptions,
-        timer: &mut Timer,
-    ) -> Option<Message> {
-        self.keyframe_list.next((subscriptions.keyframes, &latest.keyframe_list), timer)
-    }
-
-    /// Changes of the list of keyframes.
-    fn next_changes(
-        &mut self,
-        latest: &LatestMessages,
-        subscriptions: &Subscriptions,
-        timer: &mut Timer,
-    ) -> Option<Message> {
-        let log = latest.keyframe_log.as_ref().filter(|log| !log.is_up_to_date(self.keyframe_changes))?;
-        if !timer.is_due(self.keyframe_changes_at, subscriptions.keyframes?) {
-            return None;
-        }
-        let Changes { json, position, is_new_list } = log.next_changes(self.keyframe_changes)?;
-        if is_new_list {
-            // Clients discard points together with their keyframes.
-            self.keyframe_points.clear();
-        }
-        // The parts of a long list follow each other.
-        self.keyframe_changes_at = log.is_up_to_date(position).then_some(timer.now);
-        self.keyframe_changes = position;
-        Some(Message::text(json))
-    }
-
-    /// A chunk of the model that the client draws, or the ids of removed chunks.
-    fn next_chunk(
-        &mut self,
-        latest: &LatestMessages,
-        subscriptions: &Subscriptions,
-        timer: &mut Timer,
-    ) -> Option<Message> {
-        let subscription = subscriptions.model_chunks.as_ref()?;
-        let list = latest.model_chunks.get(&subscription.method)?;
-        match self.model_chunks.next(list, subscription, self.viewpoint.as_ref(), timer.now) {
-            NextChunk::Send(message) => Some(message),
-            NextChunk::WaitUntil(due) => {
-                timer.wait_until(due);
-                None
-            }
-            NextChunk::Wait => None,
-        }
-    }
-
-    /// The points of the newest keyframe that the client has without points.
-    fn next_points(
-        &mut self,
-        latest: &LatestMessages,
-        subscriptions: &Subscriptions,
-        timer: &mut Timer,
-    ) -> Option<Message> {
-        let period = subscriptions.keyframe_points?;
-        let log = latest.keyframe_log.as_ref()?;
-        self.keyframe_points.retain(|number| latest.keyframe_points.contains_key(number));
-        let mut newest_first = latest.keyframe_points.iter().rev();
-        let (number, message) = newest_first.find_map(|(number, message)| {
-            let is_next = !self.keyframe_points.contains(number) && log.is_sent(*number, self.keyframe_changes);
-            Some((number, message.as_ref()?)).filter(|_| is_next)
-        })?;
-        if !timer.is_due(self.keyframe_points_at, period) {
-            return None;
-        }
-        self.keyframe_points.insert(*number);
-        self.keyframe_points_at = Some(timer.now);
-        Some(message.clone())
-    }
-}
-
-/// The item's message if it is newer than the last one.
-fn newer(item: Option<&Item>, number: &mut u64) -> Option<Message> {
-    let item = item.filter(|item| item.number > *number)?;
-    *number = item.number;
-    Some(item.message.clone())
 }
 
 #[cfg(test)]
 mod tests {
-    use super::{ClientUpdates, Next};
+    use super::{ClientUpdates, NamedFeed, Next};
+    use crate::Hub;
     use crate::session::protocol::SubscribeMessage;
-    use crate::topics::broadcast::{Item, LatestMessages};
+    use crate::topics::items::Items;
     use crate::topics::keyframe_log::KeyframeLog;
+    use crate::topics::keyframe_points::PointTopic;
+    use crate::topics::keyframes::{KeyframeTopic, SharedLog};
+    use crate::topics::live_images::LiveImageTopic;
+    use crate::topics::robot::Description;
+    use crate::topics::scene::Scene;
+    use crate::topics::status::RunStatus;
     use crate::topics::subscriptions::Subscriptions;
     use crate::topics::updates::KeyframePose;
+    use crate::topics::{Item, TOPICS, Topic};
     use axum::extract::ws::Message;
     use kinematics::{Stamp, Transform};
     use serde_json::{Value, json};
@@ -310,6 +129,49 @@ mod tests {
         Item { number, message: Message::text(number.to_string()) }
     }
 
+    /// Topics whose messages the tests set without encoding.
+    struct Latest {
+        hub: Hub,
+        scene: Arc<Items<Scene>>,
+        status: Arc<Items<RunStatus>>,
+        robot: Arc<Items<Description>>,
+        images: Arc<LiveImageTopic>,
+        keyframes: Arc<KeyframeTopic>,
+        points: Arc<PointTopic>,
+    }
+
+    impl Latest {
+        fn new() -> Self {
+            let hub = Hub::new();
+            Self {
+                scene: Arc::new(Items::new(&hub)),
+                status: Arc::new(Items::new(&hub)),
+                robot: Arc::new(Items::new(&hub)),
+                images: Arc::new(LiveImageTopic::new(&hub)),
+                keyframes: Arc::new(KeyframeTopic::new(&hub)),
+                points: Arc::new(PointTopic::new(&hub)),
+                hub,
+            }
+        }
+
+        /// The feeds of a client, in the order of the table.
+        fn updates(&self) -> ClientUpdates {
+            let topics: [(&str, Arc<dyn Topic>); 6] = [
+                ("scene", self.scene.clone()),
+                ("status", self.status.clone()),
+                ("robot_state", self.robot.clone()),
+                ("live_images", self.images.clone()),
+                ("keyframes", self.keyframes.clone()),
+                ("keyframe_points", self.points.clone()),
+            ];
+            let feeds = topics.into_iter().map(|(name, topic)| {
+                let row = TOPICS.iter().find(|row| row.name == name).expect("a topic of the table");
+                NamedFeed { name: row.name, priority: row.priority, feed: topic.feed() }
+            });
+            ClientUpdates::of_feeds(feeds.collect())
+        }
+    }
+
     /// A client at a time that the test advances.
     struct Client {
         updates: ClientUpdates,
@@ -318,8 +180,8 @@ mod tests {
     }
 
     impl Client {
-        fn new() -> Self {
-            Self { updates: ClientUpdates::default(), subscriptions: Subscriptions::default(), now: Instant::now() }
+        fn of(latest: &Latest) -> Self {
+            Self { updates: latest.updates(), subscriptions: Subscriptions::default(), now: Instant::now() }
         }
 
         fn subscribe(&mut self, message: Value) {
@@ -327,8 +189,8 @@ mod tests {
             self.subscriptions.apply(message).expect("valid");
         }
 
-        fn next(&mut self, latest: &LatestMessages, allows_long: bool) -> Option<String> {
-            match self.updates.next(latest, &self.subscriptions, false, self.now, allows_long) {
+        fn next(&mut self, allows_long: bool) -> Option<String> {
+            match self.updates.next(&self.subscriptions, false, self.now, allows_long) {
                 Next::Short(message) | Next::Long(message) => Some(message.into_text().expect("text").to_string()),
                 Next::WaitUntil(_) | Next::Wait => None,
             }
@@ -337,35 +199,38 @@ mod tests {
 
     #[test]
     fn short_messages_first_then_cameras_round_robin() {
-        let mut latest = LatestMessages { scene: Some(item(1)), status: Some(item(4)), ..LatestMessages::default() };
-        latest.keyframe_list = Some(item(2));
-        latest.live_images = [(("left".into(), DEFAULT_PX), item(3)), (("right".into(), DEFAULT_PX), item(5))].into();
-        let mut client = Client::new();
-        assert_eq!(client.next(&latest, false).as_deref(), Some("1"));
-        assert_eq!(client.next(&latest, false).as_deref(), Some("4"));
-        assert_eq!(client.next(&latest, false), None, "only long messages are left");
-        assert_eq!(client.next(&latest, true).as_deref(), Some("3"));
-        latest.live_images.insert(("left".into(), DEFAULT_PX), item(6));
-        assert_eq!(client.next(&latest, true).as_deref(), Some("2"), "keyframes come after at most one image");
-        assert_eq!(client.next(&latest, true).as_deref(), Some("5"), "the other camera comes next");
+        let latest = Latest::new();
+        latest.scene.set("", item(1));
+        latest.status.set("", item(4));
+        latest.keyframes.set_list(item(2));
+        latest.images.set("left", DEFAULT_PX, item(3));
+        latest.images.set("right", DEFAULT_PX, item(5));
+        let mut client = Client::of(&latest);
+        assert_eq!(client.next(false).as_deref(), Some("1"));
+        assert_eq!(client.next(false).as_deref(), Some("4"));
+        assert_eq!(client.next(false), None, "only long messages are left");
+        assert_eq!(client.next(true).as_deref(), Some("3"));
+        latest.images.set("left", DEFAULT_PX, item(6));
+        assert_eq!(client.next(true).as_deref(), Some("2"), "keyframes come after at most one image");
+        assert_eq!(client.next(true).as_deref(), Some("5"), "the other camera comes next");
         client.now += Duration::from_millis(200);
-        assert_eq!(client.next(&latest, true).as_deref(), Some("6"));
-        assert_eq!(client.next(&latest, true), None);
+        assert_eq!(client.next(true).as_deref(), Some("6"));
+        assert_eq!(client.next(true), None);
     }
 
     #[test]
     fn each_topic_has_its_own_rate() {
-        let mut latest = LatestMessages::default();
-        let mut client = Client::new();
+        let latest = Latest::new();
+        let mut client = Client::of(&latest);
         client.subscribe(json!({"topic": "status", "rate_hz": 2}));
         client.subscribe(json!({"topic": "live_images", "rate_hz": 10, "size_px": [192, 192]}));
         let (mut n_status, mut n_images) = (0, 0);
         for tick in 0..200_u64 {
-            latest.status = Some(item(3 * tick + 1));
-            latest.live_images.insert(("left".into(), [192, 192]), item(3 * tick + 2));
+            latest.status.set("", item(3 * tick + 1));
+            latest.images.set("left", [192, 192], item(3 * tick + 2));
             // An image of a size for another client.
-            latest.live_images.insert(("left".into(), DEFAULT_PX), item(3 * tick + 3));
-            while let Some(sent) = client.next(&latest, true) {
+            latest.images.set("left", DEFAULT_PX, item(3 * tick + 3));
+            while let Some(sent) = client.next(true) {
                 match sent.parse::<u64>().expect("a number") % 3 {
                     1 => n_status += 1,
                     2 => n_images += 1,
@@ -377,32 +242,34 @@ mod tests {
         assert_eq!((n_status, n_images), (8, 40), "in 4 s");
         client.subscribe(json!({"topic": "live_images", "rate_hz": 0}));
         client.subscribe(json!({"topic": "status", "rate_hz": 0}));
-        latest.status = Some(item(9000));
-        latest.live_images.insert(("left".into(), DEFAULT_PX), item(9001));
+        latest.status.set("", item(9000));
+        latest.images.set("left", DEFAULT_PX, item(9001));
         client.now += Duration::from_secs(9);
-        assert_eq!(client.next(&latest, true), None);
+        assert_eq!(client.next(true), None);
     }
 
     #[test]
     fn the_end_of_a_pause_is_known() {
-        let mut client = Client::new();
-        let mut latest = LatestMessages { status: Some(item(1)), ..LatestMessages::default() };
-        assert_eq!(client.next(&latest, true).as_deref(), Some("1"));
+        let latest = Latest::new();
+        let mut client = Client::of(&latest);
+        latest.status.set("", item(1));
+        assert_eq!(client.next(true).as_deref(), Some("1"));
         let now = client.now;
-        assert_eq!(client.updates.next(&latest, &client.subscriptions, false, now, true), Next::Wait);
-        latest.status = Some(item(2));
-        let next = client.updates.next(&latest, &client.subscriptions, false, now, true);
+        assert_eq!(client.updates.next(&client.subscriptions, false, now, true), Next::Wait);
+        latest.status.set("", item(2));
+        let next = client.updates.next(&client.subscriptions, false, now, true);
         assert_eq!(next, Next::WaitUntil(now + Duration::from_millis(190)));
     }
 
     #[test]
     fn robot_is_sent_once_to_subscribed_clients() {
-        let latest = LatestMessages { robot: Some(item(1)), ..LatestMessages::default() };
-        let mut client = Client::new();
-        assert_eq!(client.next(&latest, true), None);
+        let latest = Latest::new();
+        latest.robot.set("", item(1));
+        let mut client = Client::of(&latest);
+        assert_eq!(client.next(true), None);
         client.subscribe(json!({"topic": "robot_state", "rate_hz": 60}));
-        assert_eq!(client.next(&latest, true).as_deref(), Some("1"));
-        assert_eq!(client.next(&latest, true), None);
+        assert_eq!(client.next(true).as_deref(), Some("1"));
+        assert_eq!(client.next(true), None);
     }
 
     fn keyframes(n: i64) -> Vec<KeyframePose> {
@@ -421,7 +288,7 @@ mod tests {
     struct PointsClient {
         client: Client,
         log: KeyframeLog,
-        latest: LatestMessages,
+        latest: Latest,
         keyframes: BTreeSet<u64>,
         points: BTreeSet<u64>,
         /// Numbers of points that came without their keyframe.
@@ -430,13 +297,14 @@ mod tests {
 
     impl PointsClient {
         fn new() -> Self {
-            let mut client = Client::new();
+            let latest = Latest::new();
+            let mut client = Client::of(&latest);
             client.subscribe(json!({"topic": "keyframes", "rate_hz": 2}));
             client.subscribe(json!({"topic": "keyframe_points", "rate_hz": 20}));
             Self {
                 client,
                 log: KeyframeLog::default(),
-                latest: LatestMessages::default(),
+                latest,
                 keyframes: BTreeSet::new(),
                 points: BTreeSet::new(),
                 n_dropped: 0,
@@ -447,13 +315,13 @@ mod tests {
         fn set_keyframes(&mut self, n: i64) {
             self.log.set(&keyframes(n));
             let points = |number: u64| (number, Some(Message::text(number.to_string())));
-            self.latest.keyframe_points = self.log.newest_first().map(|(number, _)| points(number)).collect();
-            self.latest.keyframe_log = Some(Arc::new(self.log.clone()));
+            self.latest.points.set(self.log.newest_first().map(|(number, _)| points(number)).collect());
+            self.latest.hub.latest::<SharedLog>().send_replace(Some(Arc::new(self.log.clone())));
         }
 
         fn next(&mut self) -> Next {
             let Client { updates, subscriptions, now } = &mut self.client;
-            updates.next(&self.latest, subscriptions, true, *now, true)
+            updates.next(subscriptions, true, *now, true)
         }
 
         /// Receives what is sent within a time. Like the page, drops points without a keyframe.
@@ -528,7 +396,7 @@ mod tests {
         while viewer.keyframes.len() < 200 {
             // The link is so slow that a new image always waits.
             viewer.client.now += Duration::from_millis(200);
-            viewer.latest.live_images.insert(("left".into(), DEFAULT_PX), item(1 + n_images));
+            viewer.latest.images.set("left", DEFAULT_PX, item(1 + n_images));
             match viewer.next() {
                 Next::Long(message) if message == item(1 + n_images).message => n_images += 1,
                 Next::Long(message) => viewer.apply(&message.into_text().expect("text")),

@@ -1,9 +1,21 @@
 //! The depth of a keyframe as colored points, for viewers.
 
+use crate::Hub;
 use crate::session::server_message::{BinaryHeader, PointsHeader, frame};
+use crate::topics::keyframes::SharedLog;
 use crate::topics::positions::pack_positions;
+use crate::topics::{
+    ClientState, DefaultRate, EncodeContext, Feed, Priority, Publisher, Row, Timer, Topic, receiver, take_if_changed,
+};
+use axum::extract::ws::Message;
 use keyframe::{DepthMap, Keyframe};
+use kinematics::Stamp;
 use nalgebra::{Point3, Vector3};
+use parking_lot::Mutex;
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::{Arc, Weak};
+use std::time::Instant;
+use tokio::sync::watch;
 
 /// Maximum number of points per keyframe. A run has hundreds of keyframes that overlap.
 const MAX_POINTS: usize = 2500;
@@ -11,8 +23,160 @@ const MAX_POINTS: usize = 2500;
 /// depth cameras report values in between.
 const MAX_EDGE_FRAC: f64 = 0.05;
 
+/// Name in `subscribe`.
+const NAME: &str = "keyframe_points";
+
+/// The topic in the table.
+pub(crate) const ROW: Row = Row {
+    name: NAME,
+    default: DefaultRate::Off,
+    priority: Priority::Keyframes,
+    start: |hub| Arc::new(PointTopic::new(hub)),
+};
+
+/// Keyframes whose points clients can draw, by camera and stamp. The run owns them and may drop them at any time.
+type KeyframeSources = BTreeMap<(Arc<str>, i64), Weak<Keyframe>>;
+
+/// The topic.
+pub(crate) struct PointTopic {
+    log: Mutex<watch::Receiver<SharedLog>>,
+    points: Arc<Mutex<Points>>,
+}
+
+/// The points that were packed.
+#[derive(Default)]
+struct Points {
+    /// By number of the keyframe; `None` for keyframes without points.
+    messages: BTreeMap<u64, Option<Message>>,
+    is_running: bool,
+}
+
+impl PointTopic {
+    /// A topic for the keyframes of a hub.
+    pub(crate) fn new(hub: &Hub) -> Self {
+        Self { log: Mutex::new(receiver(hub)), points: Arc::default() }
+    }
+
+    /// Sets the messages of all keyframes without packing.
+    #[cfg(test)]
+    pub(crate) fn set(&self, messages: BTreeMap<u64, Option<Message>>) {
+        self.points.lock().messages = messages;
+    }
+}
+
+impl Topic for PointTopic {
+    fn encode(&self, context: &EncodeContext<'_>) {
+        let mut log = self.log.lock();
+        let mut points = self.points.lock();
+        if let Some(Some(log)) = take_if_changed(&mut log) {
+            points.messages.retain(|number, _| log.contains(*number));
+        }
+        let is_wanted = context.settled().any(|demand| demand.subscriptions.period(NAME).is_some());
+        if !is_wanted || points.is_running {
+            return;
+        }
+        let log = log.borrow();
+        let mut newest_first = log.iter().flat_map(|log| log.newest_first());
+        let Some((number, pose)) = newest_first.find(|(number, _)| !points.messages.contains_key(number)) else {
+            return;
+        };
+        points.is_running = true;
+        let source = context.hub.keyframe_source(&pose.camera, pose.stamp);
+        let task = PackingTask { number, points: Arc::clone(&self.points), publisher: context.publisher.clone() };
+        tokio::task::spawn_blocking(move || task.run(source.as_deref()));
+    }
+
+    fn clear(&self) {
+        self.points.lock().messages.clear();
+    }
+
+    fn feed(self: Arc<Self>) -> Box<dyn Feed> {
+        let log = self.log.lock().clone();
+        let points = Arc::clone(&self.points);
+        Box::new(PointFeed { log, points, sent: BTreeSet::new(), sent_at: None, n_subscriptions: 0, n_lists: 0 })
+    }
+}
+
+/// Packs the points of one keyframe. If that panics, the keyframe has no points, because another attempt would fail, too.
+struct PackingTask {
+    number: u64,
+    points: Arc<Mutex<Points>>,
+    publisher: Publisher,
+}
+
+impl PackingTask {
+    fn run(self, keyframe: Option<&Keyframe>) {
+        let packed = keyframe.and_then(|keyframe| pack_points(self.number, keyframe));
+        self.publisher.publish(|_| {
+            self.points.lock().messages.insert(self.number, packed.map(Message::binary));
+        });
+    }
+}
+
+impl Drop for PackingTask {
+    fn drop(&mut self) {
+        let mut points = self.points.lock();
+        points.messages.entry(self.number).or_insert(None);
+        points.is_running = false;
+    }
+}
+
+/// What a client has received.
+struct PointFeed {
+    log: watch::Receiver<SharedLog>,
+    points: Arc<Mutex<Points>>,
+    /// Numbers of the keyframes whose points were sent, and the time of the last ones.
+    sent: BTreeSet<u64>,
+    sent_at: Option<Instant>,
+    /// Number of the subscription, and of the keyframe list, that these points belong to.
+    n_subscriptions: u64,
+    n_lists: u64,
+}
+
+impl Feed for PointFeed {
+    /// The points of the newest keyframe that the client has without points.
+    fn next(&mut self, client: &mut ClientState<'_>, timer: &mut Timer) -> Option<Message> {
+        // Clients discard points together with their keyframes, and a new subscription begins with all points.
+        let (n_subscriptions, n_lists) = (client.subscriptions.number(NAME), client.keyframes.n_lists);
+        if n_subscriptions != self.n_subscriptions || n_lists != self.n_lists {
+            (self.n_subscriptions, self.n_lists) = (n_subscriptions, n_lists);
+            self.sent.clear();
+        }
+        let period = client.subscriptions.period(NAME)?;
+        let log = self.log.borrow();
+        let log = log.as_ref().filter(|_| client.has_keyframe_changes)?;
+        let points = self.points.lock();
+        self.sent.retain(|number| points.messages.contains_key(number));
+        let mut newest_first = points.messages.iter().rev();
+        let (number, message) = newest_first.find_map(|(number, message)| {
+            let is_next = !self.sent.contains(number) && log.is_sent(*number, client.keyframes.position);
+            Some((number, message.as_ref()?)).filter(|_| is_next)
+        })?;
+        if !timer.is_due(self.sent_at, period) {
+            return None;
+        }
+        self.sent.insert(*number);
+        self.sent_at = Some(timer.now);
+        Some(message.clone())
+    }
+}
+
+impl Hub {
+    /// Sets the keyframes of which clients can draw points. They are not kept alive.
+    pub fn set_keyframe_sources<'a>(&self, keyframes: impl IntoIterator<Item = &'a Arc<Keyframe>>) {
+        let key = |keyframe: &Keyframe| (Arc::clone(&keyframe.camera), keyframe.stamp.0);
+        let sources = keyframes.into_iter().map(|keyframe| (key(keyframe), Arc::downgrade(keyframe)));
+        self.latest::<KeyframeSources>().send_replace(sources.collect());
+    }
+
+    /// The keyframe with this camera and stamp, if the run still has it.
+    fn keyframe_source(&self, camera: &Arc<str>, stamp: Stamp) -> Option<Arc<Keyframe>> {
+        self.latest::<KeyframeSources>().borrow().get(&(Arc::clone(camera), stamp.0))?.upgrade()
+    }
+}
+
 /// The binary message with the points of a keyframe; `None` if it has no usable depth.
-pub(crate) fn pack_points(id: u64, keyframe: &Keyframe) -> Option<Vec<u8>> {
+fn pack_points(id: u64, keyframe: &Keyframe) -> Option<Vec<u8>> {
     let is_complete = |depth: &&DepthMap| depth.depth_m.len() == n_pixels(depth.size_px);
     let (points, colors) = points_in_camera(keyframe, keyframe.depth.as_ref().filter(is_complete)?);
     let (positions, meters_per_count) = pack_positions(&points)?;

@@ -1,15 +1,289 @@
-//! The kinds of data that clients receive besides pictures.
+//! The kinds of data that clients receive besides pictures, each of which is a topic.
+//!
+//! A topic has two halves. [`Topic`] takes new data from the hub, and encodes it once for all clients. [`Feed`] decides what
+//! one client receives next. What the halves share is known to the topic alone.
+//!
+//! To add a topic, write a module and a row of [`TOPICS`]. If all clients receive the same messages, implement
+//! [`ItemTopic`](items::ItemTopic), which needs a name, a period and a function that encodes. `docs/reference/protocol.md`
+//! lists the topics.
 
-pub(crate) mod base_path;
-pub(crate) mod broadcast;
+mod base_path;
 pub(crate) mod chunk_list;
-pub(crate) mod chunk_sender;
+mod chunk_sender;
 pub(crate) mod client_updates;
-pub(crate) mod keyframe_log;
-pub(crate) mod keyframe_points;
+pub(crate) mod items;
+mod keyframe_log;
+mod keyframe_points;
+pub(crate) mod keyframes;
+pub(crate) mod live_images;
+pub(crate) mod model_chunks;
 pub(crate) mod observation_map;
 mod positions;
 pub(crate) mod range_scan;
 pub(crate) mod robot;
+mod scene;
+mod status;
 pub(crate) mod subscriptions;
+#[cfg(test)]
+mod test_topic;
 pub(crate) mod updates;
+
+use crate::Hub;
+use crate::clock::ServerClock;
+use crate::hub::Demand;
+use crate::pictures::viewpoint::Viewpoint;
+use crate::topics::keyframe_log::ListPosition;
+use crate::topics::subscriptions::Subscriptions;
+use axum::extract::ws::Message;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::{Duration, Instant};
+use tokio::sync::watch;
+
+/// All topics. Within a priority, a client receives them in this order.
+pub(crate) const TOPICS: &[Row] = &[
+    items::row::<scene::Scene>(),
+    items::row::<status::RunStatus>(),
+    items::row::<base_path::BasePathTopic>(),
+    items::row::<robot::Description>(),
+    live_images::ROW,
+    items::row::<range_scan::RangeScanTopic>(),
+    keyframes::ROW,
+    keyframe_points::ROW,
+    items::row::<observation_map::Observations>(),
+    model_chunks::ROW,
+    #[cfg(test)]
+    items::row::<test_topic::Weather>(),
+];
+
+/// A topic in the table.
+pub(crate) struct Row {
+    /// Name in `subscribe`.
+    pub(crate) name: &'static str,
+    /// What a client receives before it subscribes.
+    pub(crate) default: DefaultRate,
+    /// When it is sent.
+    pub(crate) priority: Priority,
+    /// Starts the half that encodes.
+    start: fn(&Hub) -> Arc<dyn Topic>,
+}
+
+/// What a client receives before it subscribes to a topic.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum DefaultRate {
+    /// Every message. Clients cannot subscribe.
+    Always,
+    /// A message per period.
+    Period(Duration),
+    /// Nothing.
+    Off,
+}
+
+/// When messages are sent, in this order.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub(crate) enum Priority {
+    /// Short messages, before pictures.
+    Short,
+    /// Long messages about what the devices see now. They take turns with keyframes, so that neither delays the other for
+    /// long.
+    Live,
+    /// Long messages about keyframes.
+    Keyframes,
+    /// Long messages that can wait.
+    Background,
+}
+
+/// The half of a topic that encodes new data once for all clients. It works outside the sessions, on the server's thread.
+pub(crate) trait Topic: Send + Sync {
+    /// Encodes what is new and due, if a client receives it. Work that takes more than a millisecond belongs on a thread
+    /// for blocking tasks.
+    fn encode(&self, context: &EncodeContext<'_>);
+
+    /// Forgets what was encoded, because no client is connected. The next client receives everything.
+    fn clear(&self);
+
+    /// The half for a client that has received nothing.
+    fn feed(self: Arc<Self>) -> Box<dyn Feed>;
+}
+
+/// The half of a topic that decides what one client receives next.
+pub(crate) trait Feed: Send {
+    /// The next message, which counts as sent. If it is not due yet, `timer` is told when.
+    fn next(&mut self, client: &mut ClientState<'_>, timer: &mut Timer) -> Option<Message>;
+
+    /// Whether the client has received anything.
+    fn has_sent(&self) -> bool {
+        true
+    }
+}
+
+/// What the topics need to know to encode.
+pub(crate) struct EncodeContext<'a> {
+    pub(crate) hub: &'a Hub,
+    pub(crate) clock: ServerClock,
+    pub(crate) publisher: &'a Publisher,
+    pub(crate) now: Instant,
+    /// What the clients receive.
+    pub(crate) demands: Vec<Demand>,
+}
+
+impl EncodeContext<'_> {
+    /// What those clients receive that have said what they want, or have had time to.
+    pub(crate) fn settled(&self) -> impl Iterator<Item = &Demand> {
+        self.demands.iter().filter(|demand| demand.settles_at(self.now).is_none())
+    }
+
+    /// Whether a client receives a topic.
+    pub(crate) fn is_wanted(&self, topic: &str) -> bool {
+        self.demands.iter().any(|demand| demand.subscriptions.period(topic).is_some())
+    }
+}
+
+/// What the feeds of a client know about it.
+pub(crate) struct ClientState<'a> {
+    pub(crate) subscriptions: &'a Subscriptions,
+    /// Whether it receives only the changes of the keyframe list.
+    pub(crate) has_keyframe_changes: bool,
+    /// Viewpoint of its newest picture.
+    pub(crate) viewpoint: Option<&'a Viewpoint>,
+    /// The part of the keyframe list that it has.
+    pub(crate) keyframes: &'a mut KeyframeProgress,
+}
+
+/// The part of the keyframe list that a client has.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct KeyframeProgress {
+    pub(crate) position: ListPosition,
+    /// How often the list was started. Clients discard points together with their keyframes.
+    pub(crate) n_lists: u64,
+}
+
+/// Numbers new messages, and wakes up the sessions.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Publisher {
+    n_messages: Arc<AtomicU64>,
+    changed: watch::Sender<()>,
+}
+
+impl Publisher {
+    /// Calls `store` with the number of a new message, and then wakes up the sessions. Later messages have larger numbers.
+    pub(crate) fn publish(&self, store: impl FnOnce(u64)) {
+        store(1 + self.n_messages.fetch_add(1, Ordering::Relaxed));
+        self.changed.send_replace(());
+    }
+
+    /// Notices when messages are published.
+    pub(crate) fn changed(&self) -> watch::Receiver<()> {
+        self.changed.subscribe()
+    }
+}
+
+/// An encoded message; clones share the bytes.
+#[derive(Clone, Debug)]
+pub(crate) struct Item {
+    pub(crate) number: u64,
+    pub(crate) message: Message,
+}
+
+/// Number of the last message of a kind that a client has received, and when it was sent.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Sent {
+    pub(crate) number: u64,
+    pub(crate) at: Option<Instant>,
+}
+
+/// Decides which messages are due, and remembers when the next one is.
+#[derive(Debug)]
+pub(crate) struct Timer {
+    pub(crate) now: Instant,
+    earliest: Option<Instant>,
+}
+
+impl Timer {
+    pub(crate) fn new(now: Instant) -> Self {
+        Self { now, earliest: None }
+    }
+
+    /// Whether a message may be sent after this period since the last one.
+    pub(crate) fn is_due(&mut self, last: Option<Instant>, period: Duration) -> bool {
+        let due = last.and_then(|at| at.checked_add(period)).unwrap_or(self.now);
+        if due > self.now {
+            self.wait_until(due);
+        }
+        due <= self.now
+    }
+
+    /// Records that a message is due at this time.
+    pub(crate) fn wait_until(&mut self, due: Instant) {
+        self.earliest = Some(self.earliest.map_or(due, |earliest| earliest.min(due)));
+    }
+
+    /// When the next message is due; `None` if there is none.
+    pub(crate) fn earliest(&self) -> Option<Instant> {
+        self.earliest
+    }
+}
+
+/// Allows an event at most once per period.
+#[derive(Debug)]
+pub(crate) struct Throttle {
+    period: Duration,
+    last: Option<Instant>,
+}
+
+impl Throttle {
+    pub(crate) fn new(period: Duration) -> Self {
+        Self { period, last: None }
+    }
+
+    pub(crate) fn is_due(&self, now: Instant) -> bool {
+        self.last.is_none_or(|last| now.saturating_duration_since(last) >= self.period)
+    }
+
+    pub(crate) fn begin(&mut self, now: Instant) {
+        self.last = Some(now);
+    }
+
+    pub(crate) fn reset(&mut self) {
+        self.last = None;
+    }
+}
+
+/// Period of checking the hub for new data.
+const CHECK_PERIOD: Duration = Duration::from_millis(20);
+
+/// Starts all topics for the data of a hub.
+pub(crate) fn start_all(hub: &Hub) -> Arc<[Arc<dyn Topic>]> {
+    TOPICS.iter().map(|row| (row.start)(hub)).collect()
+}
+
+/// Encodes new data while clients are connected. Runs until the server stops.
+pub(crate) async fn encode_all(hub: Hub, clock: ServerClock, topics: Arc<[Arc<dyn Topic>]>, publisher: Publisher) {
+    let mut check = tokio::time::interval(CHECK_PERIOD);
+    check.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
+    loop {
+        check.tick().await;
+        if hub.n_clients() == 0 {
+            topics.iter().for_each(|topic| topic.clear());
+            continue;
+        }
+        let (demands, now) = (hub.demands(), Instant::now());
+        let context = EncodeContext { hub: &hub, clock, publisher: &publisher, now, demands };
+        for topic in topics.iter() {
+            topic.encode(&context);
+        }
+    }
+}
+
+/// Returns the value if it changed since the last call. An error would mean that the hub was dropped, but the hub
+/// outlives the server.
+fn take_if_changed<T: Clone>(receiver: &mut watch::Receiver<T>) -> Option<T> {
+    receiver.has_changed().unwrap_or(false).then(|| receiver.borrow_and_update().clone())
+}
+
+/// A receiver of data of the hub that also returns what was set earlier.
+fn receiver<T: Default + Send + Sync + 'static>(hub: &Hub) -> watch::Receiver<T> {
+    let mut receiver = hub.latest::<T>().subscribe();
+    receiver.mark_changed();
+    receiver
+}

@@ -1,10 +1,15 @@
 //! When and how precisely each part of the scene was observed, for viewers.
 
+use crate::Hub;
 use crate::clock::ServerClock;
 use crate::session::server_message::{BinaryHeader, ObservationsHeader, frame};
+use crate::topics::items::ItemTopic;
+use crate::topics::{DefaultRate, Priority};
+use axum::extract::ws::Message;
 use flate2::Compression;
 use flate2::write::ZlibEncoder;
 use std::io::Write;
+use std::sync::Arc;
 use std::time::Instant;
 
 /// Code of cells that no view has observed.
@@ -46,6 +51,37 @@ pub struct ObservedCell {
     /// Standard deviation of the position of its surface in the least certain direction, meters; infinite if one
     /// direction was not measured.
     pub sigma_m: f64,
+}
+
+/// The topic.
+#[derive(Default)]
+pub(crate) struct Observations;
+
+impl ItemTopic for Observations {
+    const NAME: &'static str = "observations";
+    const DEFAULT: DefaultRate = DefaultRate::Off;
+    const PRIORITY: Priority = Priority::Background;
+    type Source = Option<Arc<PackedObservations>>;
+
+    fn encode(&mut self, source: &Self::Source, clock: ServerClock) -> Vec<(Arc<str>, Message)> {
+        let message = source.as_ref().map(|packed| Message::binary(packed.message(clock)));
+        message.map(|message| ("".into(), message)).into_iter().collect()
+    }
+}
+
+impl Hub {
+    /// Whether a client shows when and how precisely the scene was observed.
+    pub fn needs_observations(&self) -> bool {
+        self.is_wanted(Observations::NAME)
+    }
+
+    /// Sets the map of observations. Compresses it, which takes some milliseconds.
+    pub fn set_observations(&self, map: &ObservationMap) {
+        match PackedObservations::new(map) {
+            Ok(packed) => _ = self.latest::<Option<Arc<PackedObservations>>>().send_replace(Some(Arc::new(packed))),
+            Err(error) => log::error!("cannot compress the map of observations: {error}"),
+        }
+    }
 }
 
 /// The message `observations` without the times that depend on the server's clock.

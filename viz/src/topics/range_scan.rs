@@ -1,10 +1,16 @@
 //! Scans of range scanners, for viewers.
 
+use crate::Hub;
+use crate::clock::ServerClock;
 use crate::session::server_message::{BinaryHeader, RangeScanHeader, frame};
+use crate::topics::items::ItemTopic;
 use crate::topics::positions::pack_positions;
+use crate::topics::{DefaultRate, Priority};
+use axum::extract::ws::Message;
 use keyframe::RangePoints;
 use kinematics::Transform;
 use nalgebra::{Point3, Vector3};
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 /// Maximum number of points that are sent per scan.
@@ -19,8 +25,48 @@ pub struct RangeScan {
     pub map_from_odom: Transform,
 }
 
+/// Latest scans by scanner name.
+type RangeScans = BTreeMap<Arc<str>, Arc<RangeScan>>;
+
+/// The topic, with the scans that were encoded.
+#[derive(Default)]
+pub(crate) struct RangeScanTopic {
+    encoded: RangeScans,
+}
+
+impl ItemTopic for RangeScanTopic {
+    const NAME: &'static str = "range_scans";
+    const DEFAULT: DefaultRate = DefaultRate::Off;
+    const PRIORITY: Priority = Priority::Live;
+    type Source = RangeScans;
+
+    fn encode(&mut self, scans: &RangeScans, _: ServerClock) -> Vec<(Arc<str>, Message)> {
+        let mut messages = Vec::new();
+        for (scanner, scan) in scans {
+            let known = self.encoded.insert(Arc::clone(scanner), Arc::clone(scan));
+            if known.is_some_and(|known| Arc::ptr_eq(&known, scan)) {
+                continue;
+            }
+            if let Some(packed) = pack_range_scan(scan) {
+                messages.push((Arc::clone(scanner), Message::binary(packed)));
+            }
+        }
+        messages
+    }
+}
+
+impl Hub {
+    /// Sets the latest scan of a range scanner. It is encoded later, on another thread, and only for clients that show
+    /// it.
+    pub fn set_range_scan(&self, range_scan: RangeScan) {
+        self.latest::<RangeScans>().send_modify(|scans| {
+            scans.insert(Arc::clone(&range_scan.scan.scanner), Arc::new(range_scan));
+        });
+    }
+}
+
 /// The binary message with a scan; `None` without points.
-pub(crate) fn pack_range_scan(range_scan: &RangeScan) -> Option<Vec<u8>> {
+fn pack_range_scan(range_scan: &RangeScan) -> Option<Vec<u8>> {
     let RangeScan { scan, map_from_odom } = range_scan;
     let origin = map_from_odom * Point3::from(scan.world_from_scanner.translation.vector);
     let stride = scan.points_in_world_m.len().div_ceil(MAX_POINTS).max(1);

@@ -1,7 +1,8 @@
 //! How often and at which size a client receives each kind of data.
 
 use crate::pictures::view_request::InvalidRequest;
-use crate::session::protocol::{MAX_RATE_HZ, SubscribeMessage, Topic};
+use crate::session::protocol::{MAX_RATE_HZ, SubscribeMessage};
+use crate::topics::{DefaultRate, TOPICS, live_images, model_chunks};
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
@@ -24,31 +25,23 @@ const MAX_PERIOD: Duration = Duration::from_secs(86_400);
 /// The subscriptions of one client.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Subscriptions {
-    /// Minimum time between two messages; `None` if the topic is not sent.
-    pub(crate) status: Option<Duration>,
-    /// The same for the keyframe list or its changes.
-    pub(crate) keyframes: Option<Duration>,
-    /// Number of subscriptions to keyframes so far. Each of them begins with the complete list.
-    pub(crate) n_keyframe_lists: u64,
-    /// Minimum time between two robot states; `None` if not sent.
-    pub(crate) robot_state: Option<Duration>,
-    /// The same for the points of two keyframes.
-    pub(crate) keyframe_points: Option<Duration>,
-    /// Number of subscriptions to points so far. Each of them begins with the points of all keyframes.
-    pub(crate) n_point_subscriptions: u64,
-    /// Minimum time between two scans of a range scanner; `None` if not sent.
-    pub(crate) range_scans: Option<Duration>,
-    /// The same for the path of the base.
-    pub(crate) base_path: Option<Duration>,
-    /// The same for the map of observations.
-    pub(crate) observations: Option<Duration>,
+    /// By name of the topic.
+    topics: BTreeMap<&'static str, Subscription>,
     /// Chunks of a model; `None` if not sent.
     pub(crate) model_chunks: Option<ChunkSubscription>,
-    n_chunk_subscriptions: u64,
     /// Images of cameras without a subscription of their own.
     live_images: ImageSubscription,
     /// Images of single cameras.
     cameras: BTreeMap<Arc<str>, ImageSubscription>,
+}
+
+/// Subscription to a topic.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+struct Subscription {
+    /// Minimum time between two messages; `None` if the topic is not sent.
+    period: Option<Duration>,
+    /// Number of subscriptions so far.
+    number: u64,
 }
 
 /// Subscription to the images of a camera.
@@ -75,19 +68,19 @@ pub(crate) struct ChunkSubscription {
 
 impl Default for Subscriptions {
     fn default() -> Self {
+        let topics = TOPICS.iter().filter_map(|row| {
+            let period = match row.default {
+                DefaultRate::Always => return None,
+                DefaultRate::Period(period) => Some(period),
+                DefaultRate::Off => None,
+            };
+            Some((row.name, Subscription { period, number: 0 }))
+        });
+        let period = Some(live_images::DEFAULT_PERIOD);
         Self {
-            status: Some(Duration::from_millis(190)),
-            keyframes: Some(Duration::from_secs(1)),
-            n_keyframe_lists: 0,
-            robot_state: None,
-            keyframe_points: None,
-            n_point_subscriptions: 0,
-            range_scans: None,
-            base_path: None,
-            observations: None,
+            topics: topics.collect(),
             model_chunks: None,
-            n_chunk_subscriptions: 0,
-            live_images: ImageSubscription { period: Some(Duration::from_millis(190)), max_px: DEFAULT_IMAGE_PX },
+            live_images: ImageSubscription { period, max_px: DEFAULT_IMAGE_PX },
             cameras: BTreeMap::new(),
         }
     }
@@ -97,13 +90,17 @@ impl Subscriptions {
     /// Applies a client's message.
     pub(crate) fn apply(&mut self, message: SubscribeMessage) -> Result<(), InvalidRequest> {
         let SubscribeMessage { topic, rate_hz, camera, size_px, method, max_bytes_per_sec } = message;
+        let Some((&topic, _)) = self.topics.get_key_value(&*topic) else {
+            let known = self.topics.keys().copied().collect();
+            return Err(InvalidRequest::Topic { got: topic, known });
+        };
         if !(0.0..=MAX_RATE_HZ).contains(&rate_hz) {
             return Err(InvalidRequest::Rate { got: rate_hz });
         }
-        if topic != Topic::LiveImages && (camera.is_some() || size_px.is_some()) {
+        if topic != live_images::NAME && (camera.is_some() || size_px.is_some()) {
             return Err(InvalidRequest::NotImages);
         }
-        if topic != Topic::ModelChunks && (method.is_some() || max_bytes_per_sec.is_some()) {
+        if topic != model_chunks::NAME && (method.is_some() || max_bytes_per_sec.is_some()) {
             return Err(InvalidRequest::NotChunks);
         }
         if let Some(got) = size_px.filter(|size_px| size_px.iter().any(|side| *side < MIN_IMAGE_PX)) {
@@ -111,35 +108,34 @@ impl Subscriptions {
         }
         let period = Duration::try_from_secs_f64(1.0 / rate_hz).unwrap_or(MAX_PERIOD).min(MAX_PERIOD);
         let period = (rate_hz > 0.0).then_some(period);
-        match topic {
-            Topic::Status => self.status = period,
-            Topic::Keyframes => {
-                self.keyframes = period;
-                self.n_keyframe_lists += 1;
-            }
-            Topic::RobotState => self.robot_state = period,
-            Topic::KeyframePoints => {
-                self.keyframe_points = period;
-                self.n_point_subscriptions += 1;
-            }
-            Topic::RangeScans => self.range_scans = period,
-            Topic::BasePath => self.base_path = period,
-            Topic::Observations => self.observations = period,
-            Topic::ModelChunks => self.model_chunks = self.chunk_subscription(period, method, max_bytes_per_sec)?,
-            Topic::LiveImages => {
-                let rounded = |size_px: [u32; 2]| size_px.map(|side| side / MIN_IMAGE_PX * MIN_IMAGE_PX);
-                let images = ImageSubscription { period, max_px: size_px.map_or(DEFAULT_IMAGE_PX, rounded) };
-                match camera {
-                    None => self.live_images = images,
-                    Some(camera) => self.set_camera(camera, images)?,
-                }
+        if topic == model_chunks::NAME {
+            self.model_chunks = self.chunk_subscription(period, method, max_bytes_per_sec)?;
+        }
+        if topic == live_images::NAME {
+            let rounded = |size_px: [u32; 2]| size_px.map(|side| side / MIN_IMAGE_PX * MIN_IMAGE_PX);
+            let images = ImageSubscription { period, max_px: size_px.map_or(DEFAULT_IMAGE_PX, rounded) };
+            match camera {
+                None => self.live_images = images,
+                Some(camera) => self.set_camera(camera, images)?,
             }
         }
+        let number = 1 + self.number(topic);
+        self.topics.insert(topic, Subscription { period, number });
         Ok(())
     }
 
+    /// Minimum time between two messages of a topic; `None` if it is not sent.
+    pub(crate) fn period(&self, topic: &str) -> Option<Duration> {
+        self.topics.get(topic)?.period
+    }
+
+    /// Number of subscriptions to a topic so far.
+    pub(crate) fn number(&self, topic: &str) -> u64 {
+        self.topics.get(topic).map_or(0, |subscription| subscription.number)
+    }
+
     fn chunk_subscription(
-        &mut self,
+        &self,
         period: Option<Duration>,
         method: Option<String>,
         max_bytes_per_sec: Option<f64>,
@@ -150,13 +146,8 @@ impl Subscriptions {
         if !CHUNK_BYTES_PER_SEC.contains(&max_bytes_per_sec) {
             return Err(InvalidRequest::ByteRate { got: max_bytes_per_sec });
         }
-        self.n_chunk_subscriptions += 1;
-        Ok(Some(ChunkSubscription {
-            number: self.n_chunk_subscriptions,
-            method: method.into(),
-            period,
-            max_bytes_per_sec,
-        }))
+        let number = 1 + self.number(model_chunks::NAME);
+        Ok(Some(ChunkSubscription { number, method: method.into(), period, max_bytes_per_sec }))
     }
 
     /// The subscription to the images of a camera.
@@ -215,19 +206,20 @@ mod tests {
         assert!(!subscriptions.has_live_images(), "neither the rear camera nor the others");
         apply(&mut subscriptions, json!({"topic": "live_images", "rate_hz": 1, "camera": "front"})).expect("valid");
         assert!(subscriptions.has_live_images(), "the front camera");
-        assert_eq!(subscriptions.robot_state, None, "costs nothing until a client subscribes");
+        assert_eq!(subscriptions.period("robot_state"), None, "costs nothing until a client subscribes");
         apply(&mut subscriptions, json!({"topic": "robot_state", "rate_hz": 50})).expect("valid");
-        assert_eq!(subscriptions.robot_state, Some(Duration::from_millis(20)));
+        assert_eq!(subscriptions.period("robot_state"), Some(Duration::from_millis(20)));
         // The slowest rate that a number can express is no error.
         apply(&mut subscriptions, json!({"topic": "status", "rate_hz": 5e-324})).expect("valid");
-        assert_eq!(subscriptions.status, Some(Duration::from_secs(86_400)));
+        assert_eq!(subscriptions.period("status"), Some(Duration::from_secs(86_400)));
     }
 
     #[test]
     fn invalid_subscriptions_are_rejected() {
         let mut subscriptions = Subscriptions::default();
         for (message, named) in [
-            (json!({"topic": "weather", "rate_hz": 1}), "weather"),
+            (json!({"topic": "tides", "rate_hz": 1}), "\"tides\", expected one of \"base_path\""),
+            (json!({"topic": "scene", "rate_hz": 1}), "\"scene\""),
             (json!({"topic": "status"}), "rate_hz"),
             (json!({"topic": "status", "rate_hz": -1}), "rate_hz is -1"),
             (json!({"topic": "status", "rate_hz": 101}), "rate_hz is 101"),

@@ -7,34 +7,35 @@ import { EditControls } from "./edit_controls";
 import { element } from "./element";
 import { showGuidance } from "./guidance";
 import { setUpHelp, showKeysInTitles } from "./help";
-import { KeyframeList } from "./keyframe_list";
 import { LinkReadout } from "./link_readout";
 import { LiveImages } from "./live_images";
 import { ModelSwitch } from "./model_switch";
-import type { Quantity } from "./observation_layer";
 import { BACKGROUND, OrbitView } from "./orbit_view";
 import { panels } from "./panels";
-import type { BinaryHeader, LiveImageHeader, ModelStatus, PictureHeader, Status, TextMessage } from "./protocol";
+import type { BinaryHeader, ModelStatus, PictureHeader, Status, TextMessage } from "./protocol";
 import { Readouts } from "./readouts";
 import { RenderScheduler } from "./render_scheduler";
 import { RobotAge } from "./robot_age";
 import { RunControls } from "./run_controls";
 import { ShownLatency } from "./shown_latency";
 import { SideView } from "./side_view";
-import { Subscriptions } from "./subscriptions";
 import { Surroundings } from "./surroundings";
+import { basePathTopic } from "./topics/base_path";
+import { KeyframePointsTopic } from "./topics/keyframe_points";
+import { KeyframesTopic } from "./topics/keyframes";
+import { LiveImagesTopic } from "./topics/live_images";
+import { ModelChunksTopic } from "./topics/model_chunks";
+import { ObservationsTopic, TINTS } from "./topics/observations";
+import { RangeScansTopic } from "./topics/range_scans";
+import { robotTopic } from "./topics/robot";
+import { statusTopic } from "./topics/status";
+import { Topics } from "./topics/topic";
 import { ViewSettings } from "./view_settings";
 
 let stages = [0.1, 0.5, 1];
 let latestStatus: Status | null = null;
 let latestStep = -1;
 let showsModel = true;
-let liveCamera: LiveImageHeader | null = null;
-/** Buttons that tint the model, their keys, and what the tint shows. */
-const TINTS: readonly { id: string; key: string; quantity: Quantity }[] = [
-  { id: "toggle-age", key: "1", quantity: "age" },
-  { id: "toggle-uncertainty", key: "2", quantity: "uncertainty" },
-];
 
 const readouts = new Readouts();
 const banner = new Banner();
@@ -60,31 +61,37 @@ const connection = new Connection(`${location.protocol === "https:" ? "wss" : "w
     view.overlays.setLive(state === "open");
     if (state === "open" && !wasOpen) {
       view.picture.forget();
-      liveImages.forget();
-      view.overlays.forgetLive();
-      robotAge.forget();
       scheduler.restart();
       shownLatency.forget();
       forgetSurfaces();
       for (const side of sides) side.restart();
-      view.points.clear();
-      view.scans.clear();
-      view.scans.setPath([]);
-      view.local.clear();
-      view.observations.clear();
-      subscriptions.restart();
-      element("toggle-points").hidden = !connection.supports("keyframe_points");
-      for (const { id } of TINTS) element(id).hidden = !connection.supports("observations");
+      topics.restart();
     }
     if (shown.dataset.state !== before) view.changed();
   },
   text: receiveText,
   binary: receiveBinary,
 });
-const liveImages = new LiveImages(() => connection.clock, () => subscriptions.update());
 const robotAge = new RobotAge(view.robot, connection.clock);
-const subscriptions = new Subscriptions(connection, liveImages);
-const keyframes = new KeyframeList();
+const changed = (): void => topics.update();
+const keyframes = new KeyframesTopic(view);
+const images = new LiveImages(() => connection.clock, changed);
+const liveImages = new LiveImagesTopic(view, images, changed);
+const points = new KeyframePointsTopic(view, changed);
+const scans = new RangeScansTopic(view, changed);
+const observations = new ObservationsTopic(view, changed);
+const chunks = new ModelChunksTopic(view, changed);
+const topics = new Topics(connection, [
+  statusTopic(receiveStatus),
+  keyframes,
+  liveImages,
+  robotTopic(view, robotAge),
+  points,
+  scans,
+  basePathTopic(view),
+  observations,
+  chunks,
+]);
 const runControls = new RunControls(connection);
 new LinkReadout(connection);
 const shownLatency = new ShownLatency(connection);
@@ -127,51 +134,26 @@ function openView(): OrbitView {
   return view;
 }
 
+function receiveStatus(status: Status): void {
+  latestStatus = status;
+  models.list(status);
+  showStatus(status);
+  runControls.show(status);
+  banner.setRunResult(status.result);
+  showGuidance(status.guidance, banner, liveImages);
+  robotAge.hasEnded = banner.isFinished;
+}
+
 function receiveText(message: TextMessage): void {
+  if (topics.receive(message)) return;
   switch (message.type) {
     case "hello":
       stages = message.default_stages;
       showRole(message.role);
       showKeysInTitles(!isPressed("toggle-fly"));
       break;
-    case "status":
-      latestStatus = message;
-      models.list(message);
-      showStatus(message);
-      runControls.show(message);
-      banner.setRunResult(message.result);
-      showGuidance(message.guidance, banner, subscriptions, liveImages);
-      robotAge.hasEnded = banner.isFinished;
-      break;
     case "scene":
       view.setScene(message);
-      break;
-    case "keyframes":
-      view.overlays.setKeyframes(message.keyframes);
-      view.changed();
-      break;
-    case "keyframe_changes":
-      keyframes.apply(message);
-      view.points.setKeyframes(keyframes.keyframes);
-      view.overlays.setKeyframes(keyframes.keyframes);
-      view.changed();
-      break;
-    case "robot":
-      view.robot.setRobot(message);
-      element("toggle-robot").hidden = false;
-      element("toggle-follow").hidden = false;
-      break;
-    case "robot_state":
-      view.robot.setState(message);
-      robotAge.received(message);
-      view.follow();
-      break;
-    case "base_path":
-      view.scans.setPath(message.points_m);
-      view.changed();
-      break;
-    case "model_chunks_removed":
-      view.local.removed(message);
       break;
     case "error":
       if (edits.failed(message)) break;
@@ -179,11 +161,6 @@ function receiveText(message: TextMessage): void {
       scheduler.failed(message.id);
       element("notice").textContent = message.message;
       break;
-    case "welcome":
-    case "heartbeat":
-    case "pong":
-    case "goodbye":
-      break; // Handled by the connection.
   }
 }
 
@@ -211,41 +188,13 @@ function updateLocalModel(model: ModelStatus): void {
   const isPossible = connection.supports("model_chunks") && model.has_chunks === true;
   element("toggle-local").hidden = !isPossible;
   const method = isPossible && isDrawnLocally && showsModel ? model.method : null;
-  view.local.method = method;
-  subscriptions.localModel = method;
+  chunks.method = method;
   scheduler.drawsLocally = method !== null;
 }
 
-function showLocalProgress(): void {
-  const { nChunks, nIncomplete } = view.local.progress;
-  element("picture-text").textContent =
-    nIncomplete > 0 ? `drawn here: ${nChunks - nIncomplete} of ${nChunks} parts` : `drawn here: ${nChunks} parts`;
-}
-
 function receiveBinary(header: BinaryHeader, payload: Uint8Array<ArrayBuffer>): void {
-  if (header.type === "picture") {
-    if (!sides.some((side) => side.receive(header, payload))) void showPicture(header, payload);
-  } else if (header.type === "range_scan") {
-    view.scans.show(header, payload);
-    element("toggle-scans").hidden = false;
-    view.changed();
-  } else if (header.type === "observations") {
-    view.observations.receive(header, payload).catch((error: unknown) => console.error("cannot show the map of observations:", error));
-  } else if (header.type === "model_chunk") {
-    view.local.receive(header, payload);
-    showLocalProgress();
-  } else if (header.type === "keyframe_points") {
-    view.points.add(header, payload);
-    view.changed();
-  } else {
-    liveImages.show(header, payload);
-    if (header.world_from_camera) {
-      liveCamera = header;
-      element("look-live", HTMLButtonElement).disabled = false;
-      const hasMoved = view.overlays.setLiveCamera({ ...header, world_from_camera: header.world_from_camera });
-      if (hasMoved) view.changed();
-    }
-  }
+  if (header.type !== "picture") topics.receive(header, payload);
+  else if (!sides.some((side) => side.receive(header, payload))) void showPicture(header, payload);
 }
 
 async function showPicture(header: PictureHeader, payload: Uint8Array<ArrayBuffer>): Promise<void> {
@@ -310,9 +259,10 @@ action("full-screen", "u", () => {
 setUpHelp();
 action("look-top", "t", () => view.lookAlong("top"));
 action("look-front", "f", () => view.lookAlong("front"));
-action("look-nearest", "n", () => view.lookFromNearest(keyframes.keyframes));
+action("look-nearest", "n", () => view.lookFromNearest(keyframes.list.keyframes));
 action("look-live", "c", () => {
-  if (liveCamera?.world_from_camera) view.lookFrom(liveCamera.world_from_camera);
+  const pose = liveImages.latest?.world_from_camera;
+  if (pose) view.lookFrom(pose);
 });
 element("look-live", HTMLButtonElement).disabled = true;
 toggle("toggle-model", "m", (isOn) => {
@@ -328,10 +278,7 @@ toggle("toggle-grid", "g", (isOn) => (view.overlays.showsGround = isOn));
 toggle("toggle-keyframes", "k", (isOn) => (view.overlays.showsKeyframes = isOn));
 toggle("toggle-crop", "x", (isOn) => (view.crop.enabled = isOn));
 toggle("toggle-measure", "d", (isOn) => (view.measure.enabled = isOn));
-toggle("toggle-images", "i", (isOn) => {
-  liveImages.enabled = isOn;
-  subscriptions.images = isOn;
-});
+toggle("toggle-images", "i", (isOn) => (liveImages.shown = isOn));
 const switchPanel = panels({ "toggle-layers": "layers", "toggle-settings": "settings", "toggle-edit": "edit" });
 const togglePanel = (button: string): void => {
   switchPanel(button);
@@ -347,20 +294,13 @@ action("erase-box", "w", () => edits.eraseBox());
 action("remove-floaters", "a", () => edits.removeFloaters());
 action("undo-edit", "z", () => edits.undoLast());
 toggle("toggle-follow", "l", (isOn) => (view.follows = isOn));
-toggle("toggle-points", "p", (isOn) => {
-  view.points.enabled = isOn;
-  subscriptions.points = isOn;
-});
-toggle("toggle-scans", "s", (isOn) => {
-  view.scans.enabled = isOn;
-  subscriptions.scans = isOn;
-});
+toggle("toggle-points", "p", (isOn) => (points.shown = isOn));
+toggle("toggle-scans", "s", (isOn) => (scans.shown = isOn));
 for (const { id, key, quantity } of TINTS) {
   toggle(id, key, (isOn) => {
     // At most one of them is on.
     for (const other of TINTS) if (other.id !== id) element(other.id).setAttribute("aria-pressed", "false");
-    view.observations.show(isOn ? quantity : null);
-    subscriptions.observations = isOn;
+    observations.tint = isOn ? quantity : null;
   });
 }
 toggle("toggle-robot", "b", (isOn) => (view.robot.enabled = isOn));

@@ -368,16 +368,7 @@ export interface HelloMessage {
 
 export interface SubscribeMessage {
   type: "subscribe";
-  topic:
-    | "status"
-    | "keyframes"
-    | "live_images"
-    | "robot_state"
-    | "keyframe_points"
-    | "range_scans"
-    | "base_path"
-    | "model_chunks"
-    | "observations";
+  topic: string;
   rate_hz: number;
   camera?: string;
   size_px?: [number, number];

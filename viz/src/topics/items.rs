@@ -1,0 +1,120 @@
+//! Topics of which all clients receive the same messages: the latest one, or the latest one per key.
+
+use crate::Hub;
+use crate::clock::ServerClock;
+use crate::topics::{
+    ClientState, DefaultRate, EncodeContext, Feed, Item, Priority, Row, Sent, Throttle, Timer, Topic, receiver,
+    take_if_changed,
+};
+use axum::extract::ws::Message;
+use parking_lot::Mutex;
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::Duration;
+use tokio::sync::watch;
+
+/// A topic of which all clients receive the same messages.
+pub(crate) trait ItemTopic: Default + Send + 'static {
+    /// Name in `subscribe`.
+    const NAME: &'static str;
+    /// What a client receives before it subscribes.
+    const DEFAULT: DefaultRate;
+    /// When it is sent.
+    const PRIORITY: Priority;
+    /// Minimum time between two versions.
+    const PERIOD: Duration = Duration::ZERO;
+    /// The data in the hub.
+    type Source: Clone + Default + Send + Sync + 'static;
+
+    /// The messages that have changed with the data, by key. A topic with a single message uses the empty key.
+    fn encode(&mut self, source: &Self::Source, clock: ServerClock) -> Vec<(Arc<str>, Message)>;
+}
+
+/// The row of a topic.
+pub(crate) const fn row<T: ItemTopic>() -> Row {
+    Row { name: T::NAME, default: T::DEFAULT, priority: T::PRIORITY, start: |hub| Arc::new(Items::<T>::new(hub)) }
+}
+
+/// The latest messages of a topic.
+pub(crate) struct Items<T: ItemTopic> {
+    state: Mutex<State<T>>,
+}
+
+struct State<T: ItemTopic> {
+    topic: T,
+    source: watch::Receiver<T::Source>,
+    encoded: Throttle,
+    items: BTreeMap<Arc<str>, Item>,
+}
+
+impl<T: ItemTopic> Items<T> {
+    /// A topic for the data of a hub.
+    pub(crate) fn new(hub: &Hub) -> Self {
+        let (topic, source, encoded) = (T::default(), receiver(hub), Throttle::new(T::PERIOD));
+        Self { state: Mutex::new(State { topic, source, encoded, items: BTreeMap::new() }) }
+    }
+
+    /// Sets a message without encoding.
+    #[cfg(test)]
+    pub(crate) fn set(&self, key: &str, item: Item) {
+        self.state.lock().items.insert(key.into(), item);
+    }
+}
+
+impl<T: ItemTopic> Topic for Items<T> {
+    fn encode(&self, context: &EncodeContext<'_>) {
+        if T::DEFAULT != DefaultRate::Always && !context.is_wanted(T::NAME) {
+            return;
+        }
+        let mut state = self.state.lock();
+        let State { topic, source, encoded, items } = &mut *state;
+        if !encoded.is_due(context.now) {
+            return;
+        }
+        let Some(source) = take_if_changed(source) else { return };
+        encoded.begin(context.now);
+        for (key, message) in topic.encode(&source, context.clock) {
+            context.publisher.publish(|number| _ = items.insert(key, Item { number, message }));
+        }
+    }
+
+    fn clear(&self) {
+        let mut state = self.state.lock();
+        state.topic = T::default();
+        state.source.mark_changed();
+        state.encoded.reset();
+        state.items.clear();
+    }
+
+    fn feed(self: Arc<Self>) -> Box<dyn Feed> {
+        Box::new(ItemFeed { items: self, sent: BTreeMap::new() })
+    }
+}
+
+/// What a client has received of a topic.
+struct ItemFeed<T: ItemTopic> {
+    items: Arc<Items<T>>,
+    sent: BTreeMap<Arc<str>, Sent>,
+}
+
+impl<T: ItemTopic> Feed for ItemFeed<T> {
+    /// The message with the key whose last message was sent longest ago.
+    fn next(&mut self, client: &mut ClientState<'_>, timer: &mut Timer) -> Option<Message> {
+        let period = match T::DEFAULT {
+            DefaultRate::Always => Duration::ZERO,
+            _ => client.subscriptions.period(T::NAME)?,
+        };
+        let state = self.items.state.lock();
+        let waiting = state.items.iter().filter_map(|(key, item)| {
+            let sent = self.sent.get(key).copied().unwrap_or_default();
+            (item.number > sent.number && timer.is_due(sent.at, period)).then_some((sent.number, key, item))
+        });
+        let (_, key, item) = waiting.min_by_key(|(number, ..)| *number)?;
+        self.sent.insert(Arc::clone(key), Sent { number: item.number, at: Some(timer.now) });
+        Some(item.message.clone())
+    }
+
+    fn has_sent(&self) -> bool {
+        !self.sent.is_empty()
+    }
+}

@@ -1,0 +1,118 @@
+//! Chunks of the models that clients draw themselves.
+
+use crate::Hub;
+use crate::topics::chunk_list::ChunkList;
+use crate::topics::chunk_sender::{ChunkSender, NextChunk};
+use crate::topics::{
+    ClientState, DefaultRate, EncodeContext, Feed, Priority, Row, Timer, Topic, receiver, take_if_changed,
+};
+use axum::extract::ws::Message;
+use kinematics::Transform;
+use parking_lot::Mutex;
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::Duration;
+use tokio::sync::watch;
+use trainer::ModelChunks;
+
+/// Name in `subscribe`.
+pub(crate) const NAME: &str = "model_chunks";
+
+/// The topic in the table.
+pub(crate) const ROW: Row = Row {
+    name: NAME,
+    default: DefaultRate::Off,
+    priority: Priority::Background,
+    start: |hub| Arc::new(ChunkTopic { lists: Mutex::new(receiver(hub)) }),
+};
+
+/// Chunks of models by method.
+type ModelLists = BTreeMap<Arc<str>, Arc<ChunkList>>;
+
+/// Pose of the models in the world of the clients; the identity if `None`.
+type WorldFromModel = Option<Transform>;
+
+/// The topic. Chunks are encoded for each client, because each has a budget of its own.
+struct ChunkTopic {
+    lists: Mutex<watch::Receiver<ModelLists>>,
+}
+
+impl Topic for ChunkTopic {
+    fn encode(&self, context: &EncodeContext<'_>) {
+        if take_if_changed(&mut self.lists.lock()).is_some() {
+            context.publisher.publish(|_| ());
+        }
+    }
+
+    fn clear(&self) {}
+
+    fn feed(self: Arc<Self>) -> Box<dyn Feed> {
+        Box::new(ChunkFeed { lists: self.lists.lock().clone(), sender: ChunkSender::default() })
+    }
+}
+
+/// What a client has received.
+struct ChunkFeed {
+    lists: watch::Receiver<ModelLists>,
+    sender: ChunkSender,
+}
+
+impl Feed for ChunkFeed {
+    /// A chunk of the model that the client draws, or the ids of removed chunks.
+    fn next(&mut self, client: &mut ClientState<'_>, timer: &mut Timer) -> Option<Message> {
+        let subscription = client.subscriptions.model_chunks.as_ref()?;
+        let list = self.lists.borrow().get(&subscription.method).cloned()?;
+        match self.sender.next(&list, subscription, client.viewpoint, timer.now) {
+            NextChunk::Send(message) => Some(message),
+            NextChunk::WaitUntil(due) => {
+                timer.wait_until(due);
+                None
+            }
+            NextChunk::Wait => None,
+        }
+    }
+}
+
+impl Hub {
+    /// The minimum time between two calls of [`Self::set_model_chunks`] for a model; `None` if no client draws it.
+    pub fn chunk_period(&self, method: &str) -> Option<Duration> {
+        self.min_over_subscriptions(|subscriptions| {
+            let chunks = subscriptions.model_chunks.as_ref().filter(|chunks| &*chunks.method == method);
+            chunks.map(|chunks| chunks.period)
+        })
+    }
+
+    /// Whether clients have the chunks of this model, so that only changed chunks are needed.
+    pub fn has_model_chunks(&self, method: &str) -> bool {
+        self.latest::<ModelLists>().borrow().contains_key(method)
+    }
+
+    /// Sets the chunks of a model, or those that have changed. They are kept only while a client draws the model.
+    pub fn set_model_chunks(&self, method: &str, chunks: ModelChunks) {
+        if self.chunk_period(method).is_none() {
+            return;
+        }
+        let world_from_model = self.latest::<WorldFromModel>().borrow().unwrap_or_default();
+        self.latest::<ModelLists>().send_modify(|lists| {
+            let mut list = lists.get(method).map(|list| (**list).clone()).unwrap_or_default();
+            list.world_from_model = world_from_model;
+            if list.apply(chunks) {
+                lists.insert(method.into(), Arc::new(list));
+            }
+        });
+    }
+
+    /// Sets the pose of models in the world of the clients, for chunks; by default, the two frames are the same.
+    pub fn set_world_from_model(&self, world_from_model: Transform) {
+        self.latest::<WorldFromModel>().send_replace(Some(world_from_model));
+    }
+
+    /// Frees the chunks of models that no client draws any longer.
+    pub(crate) fn drop_unused_chunks(&self) {
+        self.latest::<ModelLists>().send_if_modified(|lists| {
+            let n_before = lists.len();
+            lists.retain(|method, _| self.chunk_period(method).is_some());
+            lists.len() < n_before
+        });
+    }
+}

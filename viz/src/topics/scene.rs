@@ -1,0 +1,33 @@
+//! Scene extent and initial view.
+
+use crate::Hub;
+use crate::clock::ServerClock;
+use crate::session::server_message::ServerMessage;
+use crate::topics::items::ItemTopic;
+use crate::topics::updates::SceneHint;
+use crate::topics::{DefaultRate, Priority};
+use axum::extract::ws::Message;
+use std::sync::Arc;
+
+/// The topic. Every client receives it, because it cannot choose a view without it.
+#[derive(Default)]
+pub(crate) struct Scene;
+
+impl ItemTopic for Scene {
+    const NAME: &'static str = "scene";
+    const DEFAULT: DefaultRate = DefaultRate::Always;
+    const PRIORITY: Priority = Priority::Short;
+    type Source = Option<Arc<SceneHint>>;
+
+    fn encode(&mut self, source: &Self::Source, _: ServerClock) -> Vec<(Arc<str>, Message)> {
+        let message = source.as_ref().map(|hint| ServerMessage::from(&**hint).to_message());
+        message.map(|message| ("".into(), message)).into_iter().collect()
+    }
+}
+
+impl Hub {
+    /// Sets the scene extent and the initial view.
+    pub fn set_scene_hint(&self, hint: SceneHint) {
+        self.latest::<Option<Arc<SceneHint>>>().send_replace(Some(Arc::new(hint)));
+    }
+}

@@ -1,0 +1,62 @@
+//! Status of the run.
+
+use crate::Hub;
+use crate::clock::ServerClock;
+use crate::session::server_message::ServerMessage;
+use crate::topics::items::ItemTopic;
+use crate::topics::updates::{RunResult, Status};
+use crate::topics::{DefaultRate, Priority};
+use axum::extract::ws::Message;
+use std::sync::Arc;
+use std::time::Duration;
+
+/// The topic.
+#[derive(Default)]
+pub(crate) struct RunStatus;
+
+impl ItemTopic for RunStatus {
+    const NAME: &'static str = "status";
+    const DEFAULT: DefaultRate = DefaultRate::Period(Duration::from_millis(190));
+    const PRIORITY: Priority = Priority::Short;
+    const PERIOD: Duration = Duration::from_millis(100);
+    type Source = Option<Arc<Status>>;
+
+    fn encode(&mut self, source: &Self::Source, _: ServerClock) -> Vec<(Arc<str>, Message)> {
+        let message = source.as_ref().map(|status| ServerMessage::Status(status).to_message());
+        message.map(|message| ("".into(), message)).into_iter().collect()
+    }
+}
+
+impl Hub {
+    /// Sets the run status that clients receive.
+    pub fn set_status(&self, status: Status) {
+        self.latest::<Option<Arc<Status>>>().send_replace(Some(Arc::new(status.thinned())));
+    }
+
+    /// Replaces the state in the latest status and keeps its numbers, for example while the model is saved.
+    pub fn set_state(&self, state: &str) {
+        self.change_status(|status| state.clone_into(&mut status.state));
+    }
+
+    /// Sets the result of the run. Clients continue to show it after the server has stopped.
+    pub fn set_run_result(&self, result: RunResult) {
+        self.change_status(|status| {
+            "finished".clone_into(&mut status.state);
+            status.result = Some(result);
+        });
+    }
+
+    /// Changes the latest status.
+    pub fn change_status(&self, change: impl FnOnce(&mut Status)) {
+        self.latest::<Option<Arc<Status>>>().send_modify(|latest| {
+            let mut status = latest.as_deref().cloned().unwrap_or_default();
+            change(&mut status);
+            *latest = Some(Arc::new(status));
+        });
+    }
+
+    /// The latest status.
+    pub(crate) fn status(&self) -> Option<Arc<Status>> {
+        self.latest::<Option<Arc<Status>>>().borrow().clone()
+    }
+}

@@ -1,0 +1,22 @@
+// The path of a moving base.
+
+import type { OrbitView } from "../orbit_view";
+import type { BasePath } from "../protocol";
+import { on, type Topic } from "./topic";
+
+const HZ = 1;
+
+export function basePathTopic(view: OrbitView): Topic {
+  return {
+    name: "base_path",
+    capability: "base_path",
+    receivers: [
+      on<BasePath>("base_path", (message) => {
+        view.scans.setPath(message.points_m);
+        view.changed();
+      }),
+    ],
+    subscriptions: (isHidden) => [{ rate_hz: isHidden ? 0 : HZ }],
+    restart: () => view.scans.setPath([]),
+  };
+}

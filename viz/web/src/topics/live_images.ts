@@ -1,0 +1,77 @@
+// The current images of the cameras, at the size at which they are shown.
+
+import { element } from "../element";
+import type { LiveImages } from "../live_images";
+import type { OrbitView } from "../orbit_view";
+import type { LiveImageHeader } from "../protocol";
+import { on, type Subscription, type Topic } from "./topic";
+
+/** An image is labeled live for half a second. */
+const HZ = 4;
+/** Limits of the height of camera images, in CSS pixels: see `.live canvas` in app.css. */
+const IMAGE_HEIGHT = { min: 90, max: 190, ofWindow: 0.22 };
+const MAX_IMAGE_WIDTH_PX = 640;
+/** Maximum size of images that are enlarged or fill the view. */
+const ENLARGED_PX: [number, number] = [1280, 960];
+/** The server rounds image sizes down to multiples of this. */
+const IMAGE_STEP_PX = 16;
+
+export class LiveImagesTopic implements Topic {
+  readonly name = "live_images";
+  /** The newest image with a pose. */
+  latest: LiveImageHeader | null = null;
+  readonly receivers = [
+    on<LiveImageHeader>("live_image", (header, payload) => {
+      this.images.show(header, payload);
+      if (!header.world_from_camera) return;
+      this.latest = header;
+      element("look-live", HTMLButtonElement).disabled = false;
+      const hasMoved = this.view.overlays.setLiveCamera({ ...header, world_from_camera: header.world_from_camera });
+      if (hasMoved) this.view.changed();
+    }),
+  ];
+  private isShown = true;
+  private fillsView = false;
+
+  constructor(
+    private readonly view: OrbitView,
+    private readonly images: LiveImages,
+    private readonly changed: () => void,
+  ) {}
+
+  /** Whether camera images are shown. Otherwise, they are small: their poses are still needed. */
+  set shown(shown: boolean) {
+    this.images.enabled = shown;
+    this.isShown = shown;
+    this.changed();
+  }
+
+  /** Whether the camera images fill the view. */
+  set large(fillsView: boolean) {
+    this.images.canDock = !fillsView; // The side panel is hidden.
+    this.fillsView = fillsView;
+    this.changed();
+  }
+
+  subscriptions(isHidden: boolean): Subscription[] {
+    const cameras = [...this.images.resized];
+    if (isHidden) return [{ rate_hz: 0 }, ...cameras.map(([camera]) => ({ camera, rate_hz: 0 }))];
+    const sizePx = (isLarge: boolean): [number, number] => (isLarge || this.fillsView ? ENLARGED_PX : this.thumbnailPx());
+    return [
+      { rate_hz: HZ, size_px: sizePx(false) },
+      ...cameras.map(([camera, isEnlarged]) => ({ rate_hz: HZ, camera, size_px: sizePx(isEnlarged && this.isShown) })),
+    ];
+  }
+
+  restart(): void {
+    this.images.forget();
+    this.view.overlays.forgetLive();
+  }
+
+  private thumbnailPx(): [number, number] {
+    if (!this.isShown) return [IMAGE_STEP_PX, IMAGE_STEP_PX];
+    const { min, max, ofWindow } = IMAGE_HEIGHT;
+    const height = Math.min(max, Math.max(min, ofWindow * window.innerHeight)) * Math.min(devicePixelRatio, 2);
+    return [MAX_IMAGE_WIDTH_PX, IMAGE_STEP_PX * Math.ceil(height / IMAGE_STEP_PX)];
+  }
+}

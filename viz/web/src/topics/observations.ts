@@ -1,0 +1,45 @@
+// When and how precisely each part of the scene was observed.
+
+import { element } from "../element";
+import type { Quantity } from "../observation_layer";
+import type { OrbitView } from "../orbit_view";
+import type { ObservationsHeader } from "../protocol";
+import { on, type Subscription, type Topic } from "./topic";
+
+/** Maps have about 30 kB each. */
+const HZ = 0.5;
+/** Buttons that tint the model, their keys, and what the tint shows. */
+export const TINTS: readonly { id: string; key: string; quantity: Quantity }[] = [
+  { id: "toggle-age", key: "1", quantity: "age" },
+  { id: "toggle-uncertainty", key: "2", quantity: "uncertainty" },
+];
+
+export class ObservationsTopic implements Topic {
+  readonly name = "observations";
+  readonly capability = "observations";
+  readonly receivers = [
+    on<ObservationsHeader>("observations", (header, payload) => {
+      const failed = (error: unknown): void => console.error("cannot show the map of observations:", error);
+      this.view.observations.receive(header, payload).catch(failed);
+    }),
+  ];
+  private isShown = false;
+
+  constructor(private readonly view: OrbitView, private readonly changed: () => void) {}
+
+  /** What the tint of the model shows; null without a tint. */
+  set tint(quantity: Quantity | null) {
+    this.view.observations.show(quantity);
+    this.isShown = quantity !== null;
+    this.changed();
+  }
+
+  subscriptions(isHidden: boolean): Subscription[] {
+    return [{ rate_hz: this.isShown && !isHidden ? HZ : 0 }];
+  }
+
+  restart(isSupported: boolean): void {
+    this.view.observations.clear();
+    for (const { id } of TINTS) element(id).hidden = !isSupported;
+  }
+}

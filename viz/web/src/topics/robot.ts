@@ -1,0 +1,30 @@
+// The robot: its description, which comes once, and its joint positions.
+
+import { element } from "../element";
+import type { OrbitView } from "../orbit_view";
+import type { Robot, RobotState } from "../protocol";
+import type { RobotAge } from "../robot_age";
+import { on, type Topic } from "./topic";
+
+const HZ = 60;
+
+export function robotTopic(view: OrbitView, age: RobotAge): Topic {
+  return {
+    name: "robot_state",
+    capability: "robot",
+    receivers: [
+      on<Robot>("robot", (message) => {
+        view.robot.setRobot(message);
+        element("toggle-robot").hidden = false;
+        element("toggle-follow").hidden = false;
+      }),
+      on<RobotState>("robot_state", (message) => {
+        view.robot.setState(message);
+        age.received(message);
+        view.follow();
+      }),
+    ],
+    subscriptions: (isHidden) => [{ rate_hz: isHidden ? 0 : HZ }],
+    restart: () => age.forget(),
+  };
+}
