@@ -10,8 +10,8 @@ mkdirSync(join(here, "dist"), { recursive: true });
 await build({
   entryPoints: {
     app: join(here, "src/main.ts"),
-    splat_worker: join(here, "src/splat_worker.ts"),
-    video_worker: join(here, "src/video_worker.ts"),
+    splat_worker: join(here, "src/layers/splat_worker.ts"),
+    video_worker: join(here, "src/view/video_worker.ts"),
   },
   outdir: join(here, "dist"),
   bundle: true,

@@ -2,7 +2,7 @@
 //!
 //! Logarithmic counts have the same relative error at all distances. Most differences between neighbors are then 0, and
 //! zlib finds the patterns that repeat from row to row. Predicting from three neighbors gains nothing on real pictures.
-//! `web/src/compact_depth.ts` is the decoder.
+//! `web/src/layers/compact_depth.ts` is the decoder.
 
 use flate2::Compression;
 use flate2::write::ZlibEncoder;

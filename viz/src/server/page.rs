@@ -128,7 +128,7 @@ mod tests {
     #[test]
     fn keys_in_titles_are_unique_and_have_actions() {
         let main = include_str!("../../web/src/main.ts");
-        let help = include_str!("../../web/src/help.ts");
+        let help = include_str!("../../web/src/panels/help.ts");
         let keys: Vec<_> = buttons().into_iter().filter_map(|(id, title)| Some((id, key_of(title)?))).collect();
         assert!(keys.len() > 20, "{keys:?}");
         for (ix, (id, key)) in keys.iter().enumerate() {

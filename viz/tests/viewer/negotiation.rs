@@ -212,7 +212,7 @@ fn idle_page_receives_less_than_80_kb_per_second() {
     client.text();
     let capabilities = ["views", "subscribe", "compact_depth", "keyframe_changes", "parts", "heartbeat", "robot"];
     client.send_json(&json!({"type": "hello", "protocols": [3, 4], "capabilities": capabilities}));
-    // The rates and the size of web/src/subscriptions.ts.
+    // The rates and the size of web/src/topics/.
     for (topic, rate_hz) in [("status", 2), ("keyframes", 2), ("robot_state", 60)] {
         client.send_json(&json!({"type": "subscribe", "topic": topic, "rate_hz": rate_hz}));
     }

@@ -264,7 +264,7 @@ fn check_live_frustum(browser: &mut Browser, request: &RenderRequest) {
     const REACH_PX: i64 = 2; // Rounding to pixels, and lines one pixel wide.
     let shot = canvas_shot(browser);
     let camera = side_camera();
-    let depth = 1.6 * 0.12 * 0.8; // Depth of the drawn frustum: see web/src/overlays.ts.
+    let depth = 1.6 * 0.12 * 0.8; // Depth of the drawn frustum: see web/src/layers/overlays.ts.
     let corner = |u: f64, v: f64| {
         let at = |pixel: f64, focal: f64, principal: f64| (pixel - principal) / focal * depth;
         camera.world_from_camera

@@ -385,7 +385,7 @@ fn live_images_reach_every_client_once_as_jpeg() {
 fn every_wire_field_is_documented_and_typed() {
     let folder = std::path::PathBuf::from(env!("CARGO_MANIFEST_DIR"));
     let docs = std::fs::read_to_string(folder.join("../docs/reference/protocol.md")).expect("the docs");
-    let page = std::fs::read_to_string(folder.join("web/src/protocol.ts")).expect("the page's messages");
+    let page = std::fs::read_to_string(folder.join("web/src/connection/protocol.ts")).expect("the page's messages");
     assert!(docs.contains(&format!("version **{}** of the protocol", viz::PROTOCOL_VERSION)));
     assert!(page.contains(&format!("PROTOCOL_VERSION = {};", viz::PROTOCOL_VERSION)));
     for message in one_of_each() {
@@ -393,7 +393,7 @@ fn every_wire_field_is_documented_and_typed() {
         let section = section_of(&docs, kind);
         for name in message.as_object().expect("an object").keys().filter(|name| *name != "type") {
             assert!(section.contains(&format!("`{name}`")), "{kind}.{name} is not in docs/reference/protocol.md");
-            assert!(page.contains(&format!("{name}:")), "{kind}.{name} is not in web/src/protocol.ts");
+            assert!(page.contains(&format!("{name}:")), "{kind}.{name} is not in web/src/connection/protocol.ts");
         }
     }
 }

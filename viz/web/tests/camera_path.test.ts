@@ -1,7 +1,7 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
 import { Vector3 } from "three";
-import { CameraPath, type PathView } from "../src/camera_path";
+import { CameraPath, type PathView } from "../src/view/camera_path";
 import { assertClose, fakeClock } from "./close";
 
 /** Frames from one view to the next: 2 s at 30 Hz. */

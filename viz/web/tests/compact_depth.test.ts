@@ -1,8 +1,8 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
 import { deflateSync } from "node:zlib";
-import { decodeCompactDepth } from "../src/compact_depth";
-import { decodeDepth } from "../src/depth_part";
+import { decodeCompactDepth } from "../src/layers/compact_depth";
+import { decodeDepth } from "../src/layers/depth_part";
 import { assertClose } from "./close";
 
 const MIN_M = 0.5;

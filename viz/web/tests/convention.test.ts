@@ -1,7 +1,7 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
 import { PerspectiveCamera, Vector3 } from "three";
-import { pinholeOfThreeCamera, poseOfThreeCamera, worldFromCamera } from "../src/convention";
+import { pinholeOfThreeCamera, poseOfThreeCamera, worldFromCamera } from "../src/view/convention";
 import { assertClose } from "./close";
 
 test("the pose of a three.js camera has x right, y down, z forward", () => {

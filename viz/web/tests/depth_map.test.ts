@@ -1,8 +1,8 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
 import { Matrix4, Ray, Vector3 } from "three";
-import { PanoramaDepthMap, PictureDepthMap } from "../src/depth_map";
-import { type PosedDepth, pixelAt, surfacePoint } from "../src/surface_picker";
+import { PanoramaDepthMap, PictureDepthMap } from "../src/layers/depth_map";
+import { type PosedDepth, pixelAt, surfacePoint } from "../src/view/surface_picker";
 import { assertClose } from "./close";
 
 /** A picture of 400 x 200 pixels with a depth map of 4 x 2, seen from (1, 2, 3) along world z. */

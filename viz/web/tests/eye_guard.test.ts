@@ -1,8 +1,8 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
 import { Matrix4, Vector3 } from "three";
-import { PictureDepthMap } from "../src/depth_map";
-import { EyeGuard, type HitMesh, type Viewpoint } from "../src/eye_guard";
+import { PictureDepthMap } from "../src/layers/depth_map";
+import { EyeGuard, type HitMesh, type Viewpoint } from "../src/view/eye_guard";
 import { assertClose } from "./close";
 
 const NEAR_M = 0.01;

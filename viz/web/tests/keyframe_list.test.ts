@@ -1,7 +1,7 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
-import { KeyframeList } from "../src/keyframe_list";
-import type { KeyframeChanges, NumberedKeyframe } from "../src/protocol";
+import { KeyframeList } from "../src/panels/keyframe_list";
+import type { KeyframeChanges, NumberedKeyframe } from "../src/connection/protocol";
 
 function keyframe(id: number, x: number): NumberedKeyframe {
   const world_from_camera = [1, 0, 0, x, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1];

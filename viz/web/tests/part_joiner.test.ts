@@ -1,7 +1,7 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
-import { PartJoiner } from "../src/part_joiner";
-import type { PartHeader } from "../src/protocol";
+import { PartJoiner } from "../src/connection/part_joiner";
+import type { PartHeader } from "../src/connection/protocol";
 
 function part(message: number, offset: number, bytes: number): PartHeader {
   return { type: "part", message, offset, bytes };

@@ -1,7 +1,7 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
-import { agree } from "../src/negotiation";
-import { CAPABILITIES, type Hello, unframe } from "../src/protocol";
+import { agree } from "../src/connection/negotiation";
+import { CAPABILITIES, type Hello, unframe } from "../src/connection/protocol";
 
 function framed(header: string, payload: number[], nHeader?: number): ArrayBuffer {
   const text = new TextEncoder().encode(header);

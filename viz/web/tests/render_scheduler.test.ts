@@ -1,8 +1,8 @@
 import assert from "node:assert/strict";
 import { type TestContext, test } from "node:test";
-import type { Connection } from "../src/connection";
-import type { ClientMessage, PictureHeader, RenderMessage } from "../src/protocol";
-import { RenderScheduler, type View } from "../src/render_scheduler";
+import type { Connection } from "../src/connection/connection";
+import type { ClientMessage, PictureHeader, RenderMessage } from "../src/connection/protocol";
+import { RenderScheduler, type View } from "../src/connection/render_scheduler";
 import { fakeClock } from "./close";
 
 const VIEW: View = {

@@ -1,9 +1,9 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
 import { Vector3 } from "three";
-import type { Occlusion } from "../src/occlusion";
-import type { Robot, RobotJoint } from "../src/protocol";
-import { RobotLayer } from "../src/robot_layer";
+import type { Occlusion } from "../src/layers/occlusion";
+import type { Robot, RobotJoint } from "../src/connection/protocol";
+import { RobotLayer } from "../src/layers/robot_layer";
 import { assertClose } from "./close";
 
 function translation(x: number, y: number, z: number): number[] {

@@ -1,6 +1,6 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
-import { ServerClock } from "../src/server_clock";
+import { ServerClock } from "../src/connection/server_clock";
 import { fakeClock } from "./close";
 
 test("nothing is known before the first answer", (context) => {

@@ -1,6 +1,6 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
-import { SplatSorter, UNIT_SPLATS } from "../src/splat_sorter";
+import { SplatSorter, UNIT_SPLATS } from "../src/layers/splat_sorter";
 
 const MIN_M: [number, number, number] = [-1, -2, -3];
 const MAX_M: [number, number, number] = [1, 2, 5];

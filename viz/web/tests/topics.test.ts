@@ -1,9 +1,9 @@
 import assert from "node:assert/strict";
 import { beforeEach, test } from "node:test";
-import type { Connection } from "../src/connection";
-import type { LiveImages } from "../src/live_images";
-import type { OrbitView } from "../src/orbit_view";
-import type { Capability, ClientMessage, SubscribeMessage } from "../src/protocol";
+import type { Connection } from "../src/connection/connection";
+import type { LiveImages } from "../src/panels/live_images";
+import type { OrbitView } from "../src/view/orbit_view";
+import type { Capability, ClientMessage, SubscribeMessage } from "../src/connection/protocol";
 import { KeyframePointsTopic } from "../src/topics/keyframe_points";
 import { LiveImagesTopic } from "../src/topics/live_images";
 import { ModelChunksTopic } from "../src/topics/model_chunks";

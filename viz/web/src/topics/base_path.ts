@@ -1,7 +1,7 @@
 // The path of a moving base.
 
-import type { OrbitView } from "../orbit_view";
-import type { BasePath } from "../protocol";
+import type { OrbitView } from "../view/orbit_view";
+import type { BasePath } from "../connection/protocol";
 import { on, type Topic } from "./topic";
 
 const HZ = 1;

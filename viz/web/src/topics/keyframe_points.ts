@@ -1,8 +1,8 @@
 // The measured points of the keyframes.
 
-import { element } from "../element";
-import type { OrbitView } from "../orbit_view";
-import type { KeyframePointsHeader } from "../protocol";
+import { element } from "../panels/element";
+import type { OrbitView } from "../view/orbit_view";
+import type { KeyframePointsHeader } from "../connection/protocol";
 import { on, type Subscription, type Topic } from "./topic";
 
 /** Keyframes whose points are sent per second, 22 kB each. */

@@ -1,8 +1,8 @@
 // The poses of the keyframes.
 
-import { KeyframeList } from "../keyframe_list";
-import type { OrbitView } from "../orbit_view";
-import type { KeyframeChanges, Keyframes } from "../protocol";
+import { KeyframeList } from "../panels/keyframe_list";
+import type { OrbitView } from "../view/orbit_view";
+import type { KeyframeChanges, Keyframes } from "../connection/protocol";
 import { on, type Topic } from "./topic";
 
 const HZ = 2;

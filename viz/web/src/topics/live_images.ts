@@ -1,9 +1,9 @@
 // The current images of the cameras, at the size at which they are shown.
 
-import { element } from "../element";
-import type { LiveImages } from "../live_images";
-import type { OrbitView } from "../orbit_view";
-import type { LiveImageHeader } from "../protocol";
+import { element } from "../panels/element";
+import type { LiveImages } from "../panels/live_images";
+import type { OrbitView } from "../view/orbit_view";
+import type { LiveImageHeader } from "../connection/protocol";
 import { on, type Subscription, type Topic } from "./topic";
 
 /** An image is labeled live for half a second. */

@@ -1,8 +1,8 @@
 // Chunks of the model that the page draws itself.
 
-import { element } from "../element";
-import type { OrbitView } from "../orbit_view";
-import type { ModelChunkHeader, ModelChunksRemoved } from "../protocol";
+import { element } from "../panels/element";
+import type { OrbitView } from "../view/orbit_view";
+import type { ModelChunkHeader, ModelChunksRemoved } from "../connection/protocol";
 import { on, type Subscription, type Topic } from "./topic";
 
 /** Versions of the model per second. */

@@ -1,9 +1,9 @@
 // When and how precisely each part of the scene was observed.
 
-import { element } from "../element";
-import type { Quantity } from "../observation_layer";
-import type { OrbitView } from "../orbit_view";
-import type { ObservationsHeader } from "../protocol";
+import { element } from "../panels/element";
+import type { Quantity } from "../layers/observation_layer";
+import type { OrbitView } from "../view/orbit_view";
+import type { ObservationsHeader } from "../connection/protocol";
 import { on, type Subscription, type Topic } from "./topic";
 
 /** Maps have about 30 kB each. */

@@ -1,8 +1,8 @@
 // Scans of range scanners.
 
-import { element } from "../element";
-import type { OrbitView } from "../orbit_view";
-import type { RangeScanHeader } from "../protocol";
+import { element } from "../panels/element";
+import type { OrbitView } from "../view/orbit_view";
+import type { RangeScanHeader } from "../connection/protocol";
 import { on, type Subscription, type Topic } from "./topic";
 
 /** Scans have 36 kB each. */

@@ -1,9 +1,9 @@
 // The robot: its description, which comes once, and its joint positions.
 
-import { element } from "../element";
-import type { OrbitView } from "../orbit_view";
-import type { Robot, RobotState } from "../protocol";
-import type { RobotAge } from "../robot_age";
+import { element } from "../panels/element";
+import type { OrbitView } from "../view/orbit_view";
+import type { Robot, RobotState } from "../connection/protocol";
+import type { RobotAge } from "../panels/robot_age";
 import { on, type Topic } from "./topic";
 
 const HZ = 60;

@@ -1,6 +1,6 @@
 // The status of the run.
 
-import type { Status } from "../protocol";
+import type { Status } from "../connection/protocol";
 import { on, type Topic } from "./topic";
 
 const HZ = 2;

@@ -2,8 +2,8 @@
 //
 // To add a topic, write a module with a `Topic`, and add it to the list in main.ts.
 
-import type { Connection } from "../connection";
-import type { Capability, SubscribeMessage } from "../protocol";
+import type { Connection } from "../connection/connection";
+import type { Capability, SubscribeMessage } from "../connection/protocol";
 
 /** A message, or the header of a binary message. */
 export interface Typed {

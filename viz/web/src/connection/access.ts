@@ -1,0 +1,41 @@
+// Access to a shared server: the token, and the role that the server assigns.
+
+import { element } from "../panels/element";
+import type { Role } from "./protocol";
+
+const VIEWER_REASON = "Only operators can do this; you are connected as viewer";
+
+/**
+ * Moves the token from the address to a cookie, with which the browser authenticates all requests to this server.
+ * Returns whether there was a token.
+ */
+export function keepToken(): boolean {
+  const token = new URLSearchParams(location.hash.slice(1)).get("token");
+  if (token === null || location.protocol !== "https:") return false;
+  const name = `__Host-fieldrig-${location.port || "443"}`;
+  // biome-ignore lint/suspicious/noDocumentCookie: not all browsers that can show this page have the Cookie Store API.
+  document.cookie = `${name}=${encodeURIComponent(token)}; Path=/; Secure; SameSite=Strict`;
+  history.replaceState(null, "", location.pathname + location.search);
+  return true;
+}
+
+/** Why the server refuses this page, in one sentence; empty if it does not, or does not answer. */
+export async function refusalReason(): Promise<string> {
+  try {
+    const response = await fetch("status", { cache: "no-store" });
+    return response.status === 401 || response.status === 403 ? await response.text() : "";
+  } catch {
+    return "";
+  }
+}
+
+/** Shows the role, and disables the controls with `data-operator` for viewers. Older servers have no roles. */
+export function showRole(role: Role | undefined): void {
+  const isViewer = role === "viewer";
+  element("role").textContent = isViewer ? "viewer" : "";
+  for (const control of document.querySelectorAll<HTMLButtonElement>("[data-operator]")) {
+    control.dataset.title ??= control.title;
+    control.disabled = isViewer;
+    control.title = isViewer ? VIEWER_REASON : control.dataset.title;
+  }
+}

@@ -1,0 +1,109 @@
+// Draws a mesh that arrives in chunks.
+
+import * as THREE from "three";
+import type { Crop } from "../view/crop_box";
+import { type ObservationLayer, TINT } from "./observation_layer";
+import { SOLID } from "./occlusion";
+import type { MeshChunkHeader } from "../connection/protocol";
+import { inflated } from "./zlib";
+
+const BYTES_PER_VERTEX = 9;
+
+export class MeshLayer {
+  readonly root = new THREE.Group();
+  private readonly planes: THREE.Plane[] = [];
+  private readonly material: THREE.MeshBasicMaterial;
+  private readonly chunks = new Map<number, THREE.Mesh>();
+
+  constructor(observations: ObservationLayer) {
+    // Like the server, draws surface colors without shading, and only the observed side.
+    this.material = new THREE.MeshBasicMaterial({ vertexColors: true, clippingPlanes: this.planes });
+    // The depth is increased by the tolerance of occlusion, so that objects on the surface are not hidden.
+    const factor = `1.0 + ${SOLID.relative} - ${SOLID.meters} / mvPosition.z`;
+    this.material.onBeforeCompile = (shader) => {
+      Object.assign(shader.uniforms, observations.uniforms);
+      shader.vertexShader = `varying vec3 pointInWorld;\n${shader.vertexShader}`.replace(
+        "#include <project_vertex>",
+        `#include <project_vertex>
+  gl_Position = projectionMatrix * vec4(mvPosition.xyz * (${factor}), 1.0);
+  pointInWorld = (modelMatrix * vec4(transformed, 1.0)).xyz;`,
+      );
+      shader.fragmentShader = `varying vec3 pointInWorld;\n${TINT}\n${shader.fragmentShader}`.replace(
+        "#include <color_fragment>",
+        "#include <color_fragment>\n  diffuseColor.rgb = tinted(diffuseColor.rgb, pointInWorld);",
+      );
+    };
+  }
+
+  /** Adds a chunk or replaces its older version. Decodes it first; `isCurrent` says whether it is still wanted then. */
+  async set(header: MeshChunkHeader, payload: Uint8Array<ArrayBuffer>, isCurrent: () => boolean): Promise<void> {
+    const geometry = await decodeMesh(header, payload);
+    if (!isCurrent()) {
+      geometry.dispose();
+      return;
+    }
+    this.remove(header.id);
+    const mesh = new THREE.Mesh(geometry, this.material);
+    mesh.position.fromArray(header.origin_m);
+    mesh.scale.setScalar(header.meters_per_count);
+    this.chunks.set(header.id, mesh);
+    this.root.add(mesh);
+  }
+
+  remove(id: number): void {
+    const mesh = this.chunks.get(id);
+    if (!mesh) return;
+    mesh.geometry.dispose();
+    this.root.remove(mesh);
+    this.chunks.delete(id);
+  }
+
+  clear(): void {
+    for (const id of [...this.chunks.keys()]) this.remove(id);
+  }
+
+  /** The first observed side of a surface on a ray: its distance, at most `maxM`, and its normal. */
+  hit(from: THREE.Vector3, direction: THREE.Vector3, maxM: number): { distance: number; normal: THREE.Vector3 } | null {
+    this.root.updateMatrixWorld();
+    const hits = new THREE.Raycaster(from, direction, 0, maxM).intersectObjects(this.root.children, false);
+    const hit = hits.find(({ point }) => this.planes.every((plane) => plane.distanceToPoint(point) >= 0));
+    if (!hit?.face) return null;
+    return { distance: hit.distance, normal: hit.face.normal.clone().transformDirection(hit.object.matrixWorld) };
+  }
+
+  /** Draws only the part of the mesh in a box. */
+  set crop(crop: Crop | undefined) {
+    const axes = [0, 1, 2].map((axis) => new THREE.Vector3().setComponent(axis, 1));
+    const planes = crop
+      ? axes.flatMap((axis, ix) => [
+          new THREE.Plane(axis, -crop.min_m[ix]!),
+          new THREE.Plane(axis.clone().negate(), crop.max_m[ix]!),
+        ])
+      : [];
+    this.planes.splice(0, this.planes.length, ...planes);
+  }
+}
+
+async function decodeMesh(header: MeshChunkHeader, payload: Uint8Array<ArrayBuffer>): Promise<THREE.BufferGeometry> {
+  const { n_vertices: nVertices, n_triangles: nTriangles } = header;
+  const hasShortIndices = nVertices <= 65_536;
+  const nIndexBytes = 3 * nTriangles * (hasShortIndices ? 2 : 4);
+  const nExpected = BYTES_PER_VERTEX * nVertices + nIndexBytes;
+  const bytes = await inflated(payload, nExpected);
+  if (bytes.length !== nExpected) throw new Error(`a mesh has ${bytes.length} bytes, not ${nExpected}`);
+  const copy = (begin: number, end: number): ArrayBuffer => bytes.slice(begin, end).buffer;
+  const positions = new Uint16Array(copy(0, 6 * nVertices));
+  const colors = bytes.slice(6 * nVertices, 9 * nVertices);
+  // Values are differences to those of the previous vertex. Typed arrays wrap around like the encoder.
+  for (let ix = 3; ix < positions.length; ix++) positions[ix]! += positions[ix - 3]!;
+  for (let ix = 3; ix < colors.length; ix++) colors[ix]! += colors[ix - 3]!;
+  const indexBytes = copy(9 * nVertices, nExpected);
+  const indices = hasShortIndices ? new Uint16Array(indexBytes) : new Uint32Array(indexBytes);
+  for (let ix = 1; ix < indices.length; ix++) indices[ix]! += indices[ix - 1]!;
+  const geometry = new THREE.BufferGeometry();
+  geometry.setAttribute("position", new THREE.BufferAttribute(positions, 3));
+  geometry.setAttribute("color", new THREE.BufferAttribute(colors, 3, true));
+  geometry.setIndex(new THREE.BufferAttribute(indices, 1));
+  geometry.computeBoundingSphere();
+  return geometry;
+}

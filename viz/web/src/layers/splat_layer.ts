@@ -1,0 +1,180 @@
+// Draws Gaussian splats that arrive in chunks.
+
+import * as THREE from "three";
+import type { Crop } from "../view/crop_box";
+import type { ObservationLayer } from "./observation_layer";
+import type { SplatChunkHeader } from "../connection/protocol";
+import { SplatDepth } from "./splat_depth";
+import { SplatMemory } from "./splat_memory";
+import { SPLAT_FRAGMENT, SPLAT_VERTEX } from "./splat_shader";
+import type { FreeUnits, SetChunk, Sort, SortResult } from "./splat_sorter";
+
+const FAR_AWAY = 1e9;
+
+export class SplatLayer {
+  readonly mesh: THREE.Mesh<THREE.InstancedBufferGeometry, THREE.RawShaderMaterial>;
+  private readonly depth: SplatDepth;
+  private readonly memory = new SplatMemory();
+  private readonly units = new Map<number, number[]>();
+  private worker: Worker | null = null;
+  private isSorting = false;
+  /** What the newest requested order is for, and whether the splats have changed since. */
+  private sortedFor = "";
+
+  constructor(
+    observations: ObservationLayer,
+    private readonly changed: () => void,
+  ) {
+    const geometry = new THREE.InstancedBufferGeometry();
+    const corners = new Float32Array([-1, -1, 0, 1, -1, 0, 1, 1, 0, -1, 1, 0]);
+    geometry.setAttribute("position", new THREE.BufferAttribute(corners, 3));
+    geometry.setIndex([0, 1, 2, 0, 2, 3]);
+    geometry.instanceCount = 0;
+    const material = new THREE.RawShaderMaterial({
+      glslVersion: THREE.GLSL3,
+      vertexShader: SPLAT_VERTEX,
+      fragmentShader: SPLAT_FRAGMENT,
+      side: THREE.DoubleSide,
+      depthTest: false,
+      depthWrite: false,
+      transparent: true,
+      premultipliedAlpha: true,
+      blending: THREE.CustomBlending,
+      blendSrc: THREE.OneFactor,
+      blendDst: THREE.OneMinusSrcAlphaFactor,
+      uniforms: {
+        base: { value: null },
+        harmonics: { value: null },
+        units: { value: null },
+        cameraFromModel: { value: new THREE.Matrix4() },
+        worldFromModel: { value: new THREE.Matrix4() },
+        eyeInModel: { value: new THREE.Vector3() },
+        sizePx: { value: new THREE.Vector2() },
+        focalPx: { value: new THREE.Vector2() },
+        principalPx: { value: new THREE.Vector2() },
+        depthRange: { value: new THREE.Vector2() },
+        cropMin: { value: new THREE.Vector3() },
+        cropMax: { value: new THREE.Vector3() },
+        ...observations.uniforms,
+      },
+    });
+    this.mesh = new THREE.Mesh(geometry, material);
+    this.mesh.frustumCulled = false;
+    this.depth = new SplatDepth(material);
+    this.crop = undefined;
+  }
+
+  /** To be called when the WebGL context is restored. */
+  contextRestored(): void {
+    this.memory.uploadAgain();
+    this.depth.contextRestored();
+  }
+
+  /** Adds a chunk or replaces its older version. */
+  set(header: SplatChunkHeader, payload: Uint8Array<ArrayBuffer>): void {
+    const nWords = 4 * header.n_splats * (header.sh_degree > 0 ? 2 : 1);
+    if (payload.length !== 4 * nWords) throw new Error(`splats have ${payload.length} bytes, not ${4 * nWords}`);
+    // A copy has the alignment that typed arrays need.
+    const words = new Uint32Array(payload.slice().buffer);
+    const old = this.units.get(header.id) ?? [];
+    const units = this.memory.allocate(header.n_splats, old);
+    this.memory.write(units, header, words);
+    this.units.set(header.id, units);
+    const base = words.slice(0, 4 * header.n_splats);
+    const free = old.slice(units.length);
+    if (free.length > 0) this.post({ kind: "free", units: free });
+    this.post({ kind: "set", units, words: base, minM: header.min_m, maxM: header.max_m }, [base.buffer]);
+    this.sortedFor = "";
+  }
+
+  remove(id: number): void {
+    const units = this.units.get(id);
+    if (!units) return;
+    this.memory.free(units);
+    this.units.delete(id);
+    this.post({ kind: "free", units });
+    this.sortedFor = "";
+  }
+
+  clear(): void {
+    for (const id of [...this.units.keys()]) this.remove(id);
+    this.mesh.geometry.instanceCount = 0;
+  }
+
+  /** Draws only splats with their center in a box. */
+  set crop(crop: Crop | undefined) {
+    this.vector3("cropMin").fromArray(crop?.min_m ?? [-FAR_AWAY, -FAR_AWAY, -FAR_AWAY]);
+    this.vector3("cropMax").fromArray(crop?.max_m ?? [FAR_AWAY, FAR_AWAY, FAR_AWAY]);
+  }
+
+  /** Prepares to draw from a camera. `worldFromCamera` is in fieldrig's convention. */
+  setView(
+    worldFromCamera: THREE.Matrix4,
+    worldFromModel: THREE.Matrix4,
+    [width, height]: [number, number],
+    focalPx: [number, number],
+    [nearM, farM]: [number, number],
+  ): void {
+    if (this.units.size === 0) return;
+    const { uniforms } = this.mesh.material;
+    for (const name of ["base", "harmonics", "units"] as const) uniforms[name]!.value = this.memory[name];
+    const modelFromCamera = worldFromModel.clone().invert().multiply(worldFromCamera);
+    const cameraFromModel = uniforms.cameraFromModel!.value as THREE.Matrix4;
+    cameraFromModel.copy(modelFromCamera).invert();
+    (uniforms.worldFromModel!.value as THREE.Matrix4).copy(worldFromModel);
+    this.vector3("eyeInModel").setFromMatrixPosition(modelFromCamera);
+    (uniforms.sizePx!.value as THREE.Vector2).set(width, height);
+    (uniforms.focalPx!.value as THREE.Vector2).fromArray(focalPx);
+    (uniforms.principalPx!.value as THREE.Vector2).set(0.5 * width, 0.5 * height);
+    (uniforms.depthRange!.value as THREE.Vector2).set(nearM, farM);
+    this.requestOrder(cameraFromModel.elements);
+  }
+
+  /** Draws the depth of the view, see splat_depth.ts; null if that is not possible. */
+  drawDepth(renderer: THREE.WebGLRenderer, camera: THREE.Camera, sizePx: [number, number]): THREE.Texture | null {
+    return this.depth.draw(renderer, this.mesh, camera, sizePx);
+  }
+
+  /** Sorts the splats unless they are sorted for this view. Sorts once more later if the view changes meanwhile. */
+  private requestOrder(cameraFromModel: number[]): void {
+    const [x, y, z, offset] = [cameraFromModel[2]!, cameraFromModel[6]!, cameraFromModel[10]!, cameraFromModel[14]!];
+    const view = [x, y, z, offset].join();
+    if (this.isSorting || view === this.sortedFor) return;
+    this.isSorting = true;
+    this.sortedFor = view;
+    this.post({ kind: "sort", forward: [x, y, z], offset });
+  }
+
+  private adopt({ order }: SortResult): void {
+    this.isSorting = false;
+    if (this.units.size === 0) return; // The order is for splats that are gone.
+    const { geometry } = this.mesh;
+    let slots = geometry.getAttribute("slot") as THREE.InstancedBufferAttribute | undefined;
+    if (!slots || slots.count < order.length) {
+      // A buffer of another size belongs to another attribute.
+      geometry.dispose();
+      slots = new THREE.InstancedBufferAttribute(new Uint32Array(this.memory.capacity), 1);
+      slots.gpuType = THREE.IntType;
+      slots.setUsage(THREE.DynamicDrawUsage);
+      geometry.setAttribute("slot", slots);
+    }
+    (slots.array as Uint32Array).set(order);
+    slots.clearUpdateRanges();
+    slots.addUpdateRange(0, order.length);
+    slots.needsUpdate = true;
+    geometry.instanceCount = order.length;
+    this.changed();
+  }
+
+  private post(message: SetChunk | FreeUnits | Sort, transfer: Transferable[] = []): void {
+    if (!this.worker) {
+      this.worker = new Worker("splat_worker.js");
+      this.worker.onmessage = ({ data }: MessageEvent<SortResult>) => this.adopt(data);
+    }
+    this.worker.postMessage(message, transfer);
+  }
+
+  private vector3(name: "cropMin" | "cropMax" | "eyeInModel"): THREE.Vector3 {
+    return this.mesh.material.uniforms[name]!.value as THREE.Vector3;
+  }
+}

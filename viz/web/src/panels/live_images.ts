@@ -1,0 +1,170 @@
+// The current camera images, as thumbnails in the corner or docked in the side panel. A click on a thumbnail enlarges it.
+
+import { element } from "./element";
+import type { LiveImageHeader } from "../connection/protocol";
+import type { ServerClock } from "../connection/server_clock";
+
+/** Older images are not labeled live. */
+const LIVE_MILLIS = 500;
+/** Older images are dimmed. */
+const DIM_MILLIS = 2000;
+/** Key under which the browser stores which cameras' images are in the side panel. */
+const DOCKED_KEY = "docked-cameras";
+
+interface Slot {
+  figure: HTMLElement;
+  canvas: HTMLCanvasElement;
+  caption: HTMLElement;
+  age: HTMLElement;
+  dock: HTMLButtonElement;
+  capturedMillis: number;
+  waiting: { header: LiveImageHeader; jpeg: Uint8Array<ArrayBuffer> } | null;
+  isDecoding: boolean;
+}
+
+export class LiveImages {
+  /** Cameras whose image has been enlarged, and whether it still is. */
+  readonly resized = new Map<string, boolean>();
+  private isEnabled = true;
+  private hasDock = true;
+  /** Cameras whose image the user has moved to the side panel. */
+  private readonly docked = storedCameras();
+  private readonly slots = new Map<string, Slot>();
+
+  constructor(
+    private readonly clock: () => ServerClock,
+    private readonly onResize: () => void,
+  ) {
+    window.setInterval(() => this.showAges(), 100);
+  }
+
+  /** Shows an image, unless a newer one of its camera arrives before it is decoded. */
+  show(header: LiveImageHeader, jpeg: Uint8Array<ArrayBuffer>): void {
+    const slot = this.slots.get(header.camera) ?? this.add(header.camera);
+    slot.waiting = { header, jpeg };
+    if (!slot.isDecoding) void this.decode(slot);
+  }
+
+  private async decode(slot: Slot): Promise<void> {
+    slot.isDecoding = true;
+    for (let next = slot.waiting; next; next = slot.waiting) {
+      slot.waiting = null;
+      try {
+        const bitmap = await createImageBitmap(new Blob([next.jpeg], { type: "image/jpeg" }));
+        slot.capturedMillis = next.header.captured_millis;
+        slot.canvas.width = bitmap.width;
+        slot.canvas.height = bitmap.height;
+        slot.canvas.getContext("2d")?.drawImage(bitmap, 0, 0);
+        bitmap.close();
+      } catch {
+        // The caption shows that the image is outdated.
+      }
+      this.showAges();
+    }
+    slot.isDecoding = false;
+  }
+
+  /** Marks all images as not live: a new server has a new clock. */
+  forget(): void {
+    for (const slot of this.slots.values()) slot.capturedMillis = -Infinity;
+    this.showAges();
+  }
+
+  /** Whether the images are shown. */
+  set enabled(enabled: boolean) {
+    element("live").hidden = !enabled;
+    this.isEnabled = enabled;
+    this.showDock();
+  }
+
+  /** Whether images can be in the side panel. Otherwise, all of them are in the view. */
+  set canDock(canDock: boolean) {
+    if (canDock === this.hasDock) return;
+    this.hasDock = canDock;
+    for (const slot of this.slots.values()) this.place(slot);
+  }
+
+  /** Moves an image to where it belongs, and describes its button. */
+  private place({ figure, dock }: Slot): void {
+    const isDocked = this.docked.has(figure.dataset.camera!);
+    const parent = element(isDocked && this.hasDock ? "docked" : "live");
+    dock.textContent = isDocked ? "⇤" : "⇥";
+    dock.title = isDocked ? "Move this image to the view" : "Move this image to the side panel";
+    dock.ariaLabel = `Move the image of ${figure.dataset.camera} to the ${isDocked ? "view" : "side panel"}`;
+    const hadFocus = document.activeElement === dock;
+    parent.append(figure);
+    if (hadFocus) dock.focus();
+    if (isDocked) this.setEnlarged(figure, false);
+    this.showDock();
+  }
+
+  private setEnlarged(figure: HTMLElement, isEnlarged: boolean): void {
+    if (figure.classList.contains("enlarged") === isEnlarged) return;
+    figure.classList.toggle("enlarged", isEnlarged);
+    this.resized.set(figure.dataset.camera!, isEnlarged);
+    this.onResize();
+  }
+
+  /** The card in the side panel is visible if it contains images. */
+  private showDock(): void {
+    element("docked-card").hidden = !this.isEnabled || element("docked").childElementCount === 0;
+  }
+
+  private add(camera: string): Slot {
+    const figure = document.createElement("figure");
+    const canvas = document.createElement("canvas");
+    const caption = document.createElement("figcaption");
+    const name = document.createElement("b");
+    const age = document.createElement("span");
+    name.textContent = camera;
+    const dock = document.createElement("button");
+    caption.append(name, age, dock);
+    figure.append(canvas, caption);
+    figure.dataset.camera = camera;
+    figure.addEventListener("click", () => {
+      if (!this.docked.has(camera)) this.setEnlarged(figure, !figure.classList.contains("enlarged"));
+    });
+    dock.addEventListener("click", (event) => {
+      event.stopPropagation(); // It is not a click on the image.
+      if (!this.docked.delete(camera)) this.docked.add(camera);
+      storeCameras(this.docked);
+      this.place(slot);
+    });
+    const slot: Slot = { figure, canvas, caption, age, dock, capturedMillis: -Infinity, waiting: null, isDecoding: false };
+    this.place(slot);
+    this.slots.set(camera, slot);
+    return slot;
+  }
+
+  private showAges(): void {
+    for (const { figure, caption, age, capturedMillis } of this.slots.values()) {
+      const millis = this.clock().age(capturedMillis) ?? Infinity;
+      caption.classList.toggle("stale", millis > LIVE_MILLIS);
+      figure.classList.toggle("dimmed", millis > DIM_MILLIS);
+      age.textContent = millis > LIVE_MILLIS ? ageText(millis) : "live";
+    }
+  }
+}
+
+function storedCameras(): Set<string> {
+  try {
+    const stored: unknown = JSON.parse(localStorage.getItem(DOCKED_KEY) ?? "[]");
+    return new Set(Array.isArray(stored) ? stored.filter((camera) => typeof camera === "string") : []);
+  } catch {
+    return new Set(); // The browser stores nothing for this page.
+  }
+}
+
+function storeCameras(cameras: Set<string>): void {
+  try {
+    localStorage.setItem(DOCKED_KEY, JSON.stringify([...cameras]));
+  } catch {
+    // The images are in the side panel until the page is reloaded.
+  }
+}
+
+function ageText(millis: number): string {
+  if (!Number.isFinite(millis)) return "not live";
+  const seconds = millis / 1000;
+  return seconds < 120 ? `${seconds.toFixed(seconds < 10 ? 1 : 0)} s old` : `${Math.round(seconds / 60)} min old`;
+}
